@@ -1,0 +1,160 @@
+"""The door as a LeRobot environment: `--env.type=door`."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, _LazyAsyncVectorEnv, freeze_after_episode_end
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from env_door.env import MAX_OFFSET, DoorEnv
+from env_door.latch import KINDS
+from env_door.scene import ARMS
+from env_door.trials import TrialLog
+
+FPS = DoorEnv.metadata["render_fps"]
+IMAGE_SIZE = 128
+"""Height and width in pixels of the images that a policy sees."""
+
+TASKS = (*KINDS, "random", "all")
+
+
+class WithoutRolloutOption(gym.Wrapper):
+    """Keep LeRobot's own reset option from the environment, which refuses options that it does not know."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Reset with all the options but LeRobot's."""
+        own = {name: value for name, value in (options or {}).items() if name != NEW_ROLLOUT_OPTION}
+        return self.env.reset(seed=seed, options=own)
+
+
+def make_door(*, trial_log: str | None, **env_kwargs: Any) -> gym.Env:
+    """Make one door environment for LeRobot, with a log of its trials when a path is given."""
+    env = WithoutRolloutOption(gym.make("env_door/Door-v0", **env_kwargs))
+    return env if trial_log is None else TrialLog(env, trial_log)
+
+
+@EnvConfig.register_subclass("door")
+@dataclass
+class DoorEnvConfig(EnvConfig):
+    """Configuration of the door environment for `lerobot-eval` and `lerobot-train`.
+
+    Args:
+        task (`str`, *optional*, defaults to `"all"`):
+            Kind of door: `"push"`, `"pull"`, `"slide"`, `"random"` (drawn at each reset), or `"all"`, which
+            evaluates the three kinds one after the other and reports each by itself.
+        fps (`int`, *optional*, defaults to 10):
+            Control steps a second. The environment runs at 10 Hz only.
+        episode_length (`int`, *optional*, defaults to 300):
+            Steps after which a trial is cut.
+        arm (`str`, *optional*, defaults to `"ur5e"`):
+            `"ur5e"` (7 values with the gripper) or `"panda"` (8).
+        door_offset (`float`, *optional*, defaults to 0.0):
+            Half-width, in metres, of the range from which the lateral shift of the door is drawn; 0 to 0.05.
+        start_variation (`float`, *optional*, defaults to 0.02):
+            Spread of the tool's start position, in metres.
+        command_limit (`float`, *optional*, defaults to 0.08):
+            Largest distance, in radians, of a joint command from the measured joint.
+        trial_log (`str | None`, *optional*):
+            File that gets one JSON line for every finished trial, see [`~env_door.trials.read_trials`].
+
+    Raises:
+        ValueError: If a field is out of its range.
+    """
+
+    task: str | None = "all"
+    fps: int = FPS
+    episode_length: int = 300
+    arm: str = "ur5e"
+    door_offset: float = 0.0
+    start_variation: float = 0.02
+    command_limit: float = 0.08
+    trial_log: str | None = None
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "pixels/front": f"{OBS_IMAGES}.front",
+        }
+    )
+
+    def __post_init__(self) -> None:
+        if self.task not in TASKS:
+            raise ValueError(f"--env.task must be one of {', '.join(TASKS)}, got {self.task!r}.")
+        if self.fps != FPS:
+            raise ValueError(f"--env.fps must be {FPS}, the rate of the environment, got {self.fps}.")
+        if self.episode_length < 1:
+            raise ValueError(f"--env.episode_length must be at least 1 step, got {self.episode_length}.")
+        if self.arm not in ARMS:
+            raise ValueError(f"--env.arm must be one of {', '.join(ARMS)}, got {self.arm!r}.")
+        if not 0 <= self.door_offset <= MAX_OFFSET:
+            raise ValueError(f"--env.door_offset must be 0 to {MAX_OFFSET} m, got {self.door_offset}.")
+        if not 0 <= self.start_variation <= 0.05:
+            raise ValueError(f"--env.start_variation must be 0 to 0.05 m, got {self.start_variation}.")
+        if not 0.01 <= self.command_limit <= 1.0:
+            raise ValueError(f"--env.command_limit must be 0.01 to 1.0 rad, got {self.command_limit}.")
+        dimension = len(ARMS[self.arm].joints) + 1  # and the gripper
+        self.features |= {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(dimension,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(dimension,)),
+            "pixels/front": PolicyFeature(type=FeatureType.VISUAL, shape=(IMAGE_SIZE, IMAGE_SIZE, 3)),
+        }
+
+    @property
+    def package_name(self) -> str:
+        """Package that registers the environment."""
+        return "env_door"
+
+    @property
+    def gym_id(self) -> str:
+        """Id of the environment in Gymnasium's registry; the task is a keyword of it, not part of its name."""
+        return "env_door/Door-v0"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Keywords of `gym.make`, but for the kind of the door."""
+        return {
+            "arm": self.arm,
+            "door_offset": self.door_offset,
+            "start_variation": self.start_variation,
+            "command_limit": self.command_limit,
+            "observation_size": IMAGE_SIZE,
+            "max_episode_steps": self.episode_length,
+            "disable_env_checker": self.disable_env_checker,
+        }
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        """Make the vector environments, one suite for each kind of door.
+
+        The suites are named `door_push`, `door_pull` and so on, because `lerobot-eval` reports its figures, names
+        its videos and labels its `per_group` results by suite.
+
+        Args:
+            n_envs (`int`):
+                Number of environments that run side by side.
+            use_async_envs (`bool`, *optional*, defaults to `False`):
+                Run each environment in its own process.
+
+        Returns:
+            `dict[str, dict[int, gym.vector.VectorEnv]]`: `{suite: {0: vector environment}}`.
+        """
+        kinds = KINDS if self.task == "all" else (self.task,)
+        suites: dict[str, dict[int, Any]] = {}
+        for kind in kinds:
+            make = partial(make_door, kind=kind, trial_log=self.trial_log, **self.gym_kwargs)
+            if use_async_envs and n_envs > 1:
+                # Lazy: the processes of one kind start only when its turn has come.
+                suites[f"door_{kind}"] = {0: _LazyAsyncVectorEnv([make] * n_envs)}
+                continue
+            # A finished environment stays frozen through NEXT_STEP's automatic reset and so costs nothing.
+            suites[f"door_{kind}"] = {
+                0: gym.vector.SyncVectorEnv(
+                    [freeze_after_episode_end(make)] * n_envs,
+                    autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP,
+                )
+            }
+        return suites

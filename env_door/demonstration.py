@@ -1,0 +1,96 @@
+"""One run of the scripted expert, kept in memory."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from env_door.env import DoorEnv
+from env_door.expert import DoorExpert
+from env_door.kinematics import UnreachableError
+
+TIMING_STREAM = 1  # keeps the expert's random numbers apart from those of the environment
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """What was seen and commanded while the expert opened one door.
+
+    Args:
+        kind (`str`):
+            Kind of the door.
+        seed (`int`):
+            Seed of the environment and of the expert's timing.
+        images (`np.ndarray`):
+            Camera frames `(T, H, W, 3)`, uint8.
+        states (`np.ndarray`):
+            Measured joints `(T, D)` in radians, the gripper last in 0..1.
+        actions (`np.ndarray`):
+            Joint targets `(T, D)` applied at the frame of the same index.
+        branch_step (`int`):
+            First step whose action depends on the kind.
+        success_step (`int`):
+            First step after which the door counted as open.
+    """
+
+    kind: str
+    seed: int
+    images: np.ndarray
+    states: np.ndarray
+    actions: np.ndarray
+    branch_step: int
+    success_step: int
+
+
+def demonstrate(env: DoorEnv, kind: str, seed: int, num_steps: int) -> Demonstration | None:
+    """Let the expert open a door, and go on holding it open to the last step.
+
+    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`.
+
+    Args:
+        env (`DoorEnv`):
+            Environment without a time limit.
+        kind (`str`):
+            Kind of the door, which is also the direction that the expert tries.
+        seed (`int`):
+            Seed of the environment and of the expert's timing.
+        num_steps (`int`):
+            Length of the demonstration.
+
+    Returns:
+        `Demonstration | None`: The demonstration, or `None` when the door did not open in time or was out of reach.
+
+    Raises:
+        ValueError: If `num_steps` ends before the expert would have tried the door.
+    """
+    observation, _ = env.reset(seed=seed, options={"kind": kind})
+    expert = DoorExpert(env, directions=(kind,))
+    try:
+        expert.reset(np.random.default_rng([seed, TIMING_STREAM]))
+    except UnreachableError:
+        return None
+    if num_steps <= expert.branch_step:
+        raise ValueError(
+            f"num_steps={num_steps} ends before the door is tried, at step {expert.branch_step} with seed {seed}. "
+            "Use more steps; 150 is enough for every kind."
+        )
+    images, states, actions = [], [], []
+    success_step = None
+    for step in range(num_steps):
+        action = expert.act()
+        images.append(observation["pixels"]["front"])
+        states.append(observation["agent_pos"])
+        actions.append(action)
+        observation, _, _, _, info = env.step(action)
+        if success_step is None and info["is_success"]:
+            success_step = step
+    if success_step is None:
+        return None
+    return Demonstration(
+        kind=kind,
+        seed=seed,
+        images=np.stack(images),
+        states=np.stack(states),
+        actions=np.stack(actions),
+        branch_step=expert.branch_step,
+        success_step=success_step,
+    )

@@ -1,0 +1,308 @@
+"""The Gymnasium environment: an arm in front of a door whose kind it must find out by trying."""
+
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from env_door.kinematics import InverseKinematics
+from env_door.latch import KINDS, Latch
+from env_door.rendering import Renderer, make_renderer
+from env_door.scene import ARMS, GRIPPER_STROKE, load_model
+
+CONTROL_STEPS = 50
+"""Physics steps of 2 ms in one control step of 0.1 s."""
+
+MAX_OFFSET = 0.05
+"""Largest sideways shift of the door in metres."""
+
+START_DISTANCE = 0.16
+"""Distance in metres between the tool and the knob at the nominal start."""
+
+GRIPPER_SPEED = 1.76
+"""Largest change of the gripper target per second in units of its stroke (Robotiq 2F-85: 150 mm/s)."""
+
+GRASP_ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+"""Tool orientation for grasping the untwisted knob: z ahead into the door, fingers closing sideways (y)."""
+
+
+class DoorEnv(gym.Env):
+    """Door opening with an arm and a parallel gripper, at 10 Hz, from a camera and joint angles.
+
+    The observation holds `pixels/front`, an image `(size, size, 3)` of `uint8`, and `agent_pos`, the measured
+    joint angles in rad followed by the gripper's closure (0 open, 1 closed) as `float32`. The action has the
+    layout of `agent_pos` and holds absolute targets. As on a real controller a target is limited to the joint
+    ranges, to the joint speeds and to a distance from the measured joints before the arm moves towards it
+    along a straight line.
+
+    Args:
+        kind (`str`, *optional*, defaults to `"random"`):
+            `"push"`, `"pull"`, `"slide"`, or `"random"` for a draw at every reset.
+        arm (`str`, *optional*, defaults to `"ur5e"`):
+            `"ur5e"` (6 joints) or `"panda"` (7 joints).
+        door_offset (`float`, *optional*, defaults to `0.0`):
+            Half-width in m, 0 to 0.05, of the range from which the door's sideways shift is drawn at every
+            reset.
+        start_variation (`float`, *optional*, defaults to `0.02`):
+            Half-width in m, 0 to 0.05, of the range of the tool's start position along each axis.
+        command_limit (`float`, *optional*, defaults to `0.08`):
+            Largest distance in rad between a joint target and the measured joint; keeps a blocked arm from
+            folding up.
+        observation_size (`int`, *optional*, defaults to `128`):
+            Height and width of the observed image in pixels.
+        render_size (`int`, *optional*, defaults to `256`):
+            Height and width of the picture that `render` returns, at most 768.
+        render_mode (`str`, *optional*, defaults to `"rgb_array"`):
+            Only `"rgb_array"`.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium declares it so)
+    task = "open the door"
+    task_description = "open the door"
+
+    def __init__(
+        self,
+        kind: str = "random",
+        arm: str = "ur5e",
+        door_offset: float = 0.0,
+        start_variation: float = 0.02,
+        command_limit: float = 0.08,
+        observation_size: int = 128,
+        render_size: int = 256,
+        render_mode: str = "rgb_array",
+    ):
+        _check_kind(kind)
+        if arm not in ARMS:
+            raise ValueError(f"arm={arm!r} is unknown; choose one of {sorted(ARMS)}")
+        _check_range("door_offset", door_offset, 0.0, MAX_OFFSET, "m")
+        _check_range("start_variation", start_variation, 0.0, 0.05, "m")
+        _check_range("command_limit", command_limit, 0.01, 1.0, "rad")
+        _check_range("observation_size", observation_size, 16, 768, "pixels")
+        _check_range("render_size", render_size, 16, 768, "pixels")
+        if render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode={render_mode!r} is unknown; only 'rgb_array' is offered")
+        self.kind = kind
+        self.arm = ARMS[arm]
+        self.door_offset = door_offset
+        self.start_variation = start_variation
+        self.command_limit = command_limit
+        self.observation_size = int(observation_size)
+        self.render_size = int(render_size)
+        self.render_mode = render_mode
+        self.joint_names = (*self.arm.joints, "gripper")
+
+        self.model = load_model(arm)
+        self.data = mujoco.MjData(self.model)
+        self.latch = Latch(self.model, self.data)
+        self.kinematics = InverseKinematics(self.model, self.arm.joints)
+        joints = [self.model.joint(name) for name in self.arm.joints]
+        self._qpos = np.array([joint.qposadr[0] for joint in joints])
+        self._fingers = [int(self.model.joint(name).qposadr[0]) for name in ("finger_left", "finger_right")]
+        self._actuators = np.array([self.model.actuator(name).id for name in self.joint_names])
+        # Seconds by which a position servo trails a moving target: damping over stiffness.
+        self._servo_lag = (
+            -self.model.actuator_biasprm[self._actuators, 2] / self.model.actuator_gainprm[self._actuators, 0]
+        )
+        self._servo_lag[-1] = 0.0
+        self._low = np.array([*(joint.range[0] for joint in joints), 0.0])
+        self._high = np.array([*(joint.range[1] for joint in joints), 1.0])
+        self._max_change = np.array([*self.arm.joint_speed, GRIPPER_SPEED]) * CONTROL_STEPS * self.model.opt.timestep
+        self._doorway = int(self.model.body("doorway").id)
+        self._doorway_home = self.model.body_pos[self._doorway].copy()
+        self._target: NDArray[np.float64] = np.zeros(len(self.joint_names))
+        self._renderers: dict[str, Renderer] = {}
+
+        self.action_space = gym.spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32))
+        image = gym.spaces.Box(0, 255, (self.observation_size, self.observation_size, 3), np.uint8)
+        # Joint limits are soft in MuJoCo: a measurement may lie a little beyond them.
+        measured = gym.spaces.Box((self._low - 0.5).astype(np.float32), (self._high + 0.5).astype(np.float32))
+        self.observation_space = gym.spaces.Dict({"pixels": gym.spaces.Dict({"front": image}), "agent_pos": measured})
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Closes the door and puts the arm in front of it.
+
+        Args:
+            seed (`int`, *optional*):
+                Seed of all draws. The same seed gives the same start pose and offset for every kind of door.
+            options (`dict`, *optional*):
+                May hold `kind` (`str`) and `door_offset` (`float`, a fixed signed shift in m, at most 0.05
+                either way).
+
+        Returns:
+            `tuple[dict, dict]`: observation and info.
+
+        Raises:
+            ValueError: If an option is unknown or out of range.
+        """
+        super().reset(seed=seed)
+        options = dict(options or {})
+        # Always the same draws in the same order, whatever is overridden: seeds stay comparable across kinds.
+        drawn_kind = KINDS[self.np_random.integers(len(KINDS))]
+        drawn_offset = self.np_random.uniform(-1.0, 1.0) * self.door_offset
+        start_shift = self.np_random.uniform(-1.0, 1.0, size=3) * self.start_variation
+        kind = options.pop("kind", self.kind)
+        offset = options.pop("door_offset", drawn_offset)
+        if options:
+            raise ValueError(f"unknown reset options {sorted(options)}; 'kind' and 'door_offset' are known")
+        _check_kind(kind)
+        _check_range("door_offset", offset, -MAX_OFFSET, MAX_OFFSET, "m")
+
+        mujoco.mj_resetData(self.model, self.data)
+        self.latch.reset(drawn_kind if kind == "random" else kind)
+        self.current_offset = float(offset)
+        self.model.body_pos[self._doorway] = self._doorway_home + np.array([0.0, self.current_offset, 0.0])
+        start = self._doorway_home + self.model.site("knob").pos + np.array([-START_DISTANCE, 0.0, 0.0]) + start_shift
+        joints = self.kinematics.solve(start, GRASP_ROTATION, np.array(self.arm.ready_pose))
+        self.data.qpos[self._qpos] = joints
+        self._target = np.append(joints, 0.0)
+        self._command(self._target, np.zeros_like(self._target))
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), self._info()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Moves towards a target for 0.1 s.
+
+        Args:
+            action (`NDArray[np.float32]`):
+                Joint targets in rad and gripper target in 0 to 1, shape `(len(joint_names),)`.
+
+        Returns:
+            `tuple`: observation, reward (1.0 while the door is open, else 0.0), terminated, truncated, info.
+
+        Raises:
+            ValueError: If the action has the wrong shape or is not finite.
+            RuntimeError: If the physics diverged.
+        """
+        self.advance(action)
+        success = self.latch.is_open
+        return self._observation(), float(success), success, False, self._info()
+
+    def advance(self, action: NDArray[np.float32]) -> None:
+        """Moves the scene as `step` does, but draws no picture: for planning and measuring.
+
+        Args:
+            action (`NDArray[np.float32]`):
+                As for `step`.
+
+        Raises:
+            ValueError: If the action has the wrong shape or is not finite.
+            RuntimeError: If the physics diverged.
+        """
+        start, target = self._target, self.limit_action(action)
+        velocity = (target - start) / (CONTROL_STEPS * self.model.opt.timestep)
+        for substep in range(1, CONTROL_STEPS + 1):
+            self._command(start + (target - start) * (substep / CONTROL_STEPS), velocity)
+            mujoco.mj_step(self.model, self.data)
+            self.latch.update()
+        self._target = target
+        self._check_physics()
+
+    def limit_action(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
+        """The target that the controller really follows for an action.
+
+        Args:
+            action (`NDArray[np.float32]`):
+                As for `step`.
+
+        Returns:
+            `NDArray[np.float64]`: the action within joint ranges, joint speeds and `command_limit`.
+
+        Raises:
+            ValueError: If the action has the wrong shape or is not finite.
+        """
+        target = np.asarray(action, dtype=np.float64)
+        if target.shape != self._target.shape:
+            raise ValueError(f"action has shape {target.shape}; it must be {self._target.shape}: {self.joint_names}")
+        if not np.isfinite(target).all():
+            raise ValueError(f"action {target.tolist()} is not finite; every joint target must be a number")
+        target = np.clip(target, self._low, self._high)
+        target = np.clip(target, self._target - self._max_change, self._target + self._max_change)
+        measured = self.measured_joints()[:-1]
+        target[:-1] = np.clip(target[:-1], measured - self.command_limit, measured + self.command_limit)
+        return target
+
+    def measured_joints(self) -> NDArray[np.float64]:
+        """Measured joints.
+
+        Returns:
+            `NDArray[np.float64]`: joint angles in rad and the gripper's closure (0 open, 1 closed).
+        """
+        closure = self.data.qpos[self._fingers].sum() / GRIPPER_STROKE
+        return np.append(self.data.qpos[self._qpos], closure)
+
+    def hold_door(self, seconds: float) -> None:
+        """Holds the panel where it is for a while, then lets it go: interference.
+
+        Args:
+            seconds (`float`):
+                Simulated seconds, not negative.
+
+        Raises:
+            ValueError: If the time is negative or not finite.
+        """
+        if not (np.isfinite(seconds) and seconds >= 0):
+            raise ValueError(f"seconds={seconds!r} must be a number that is not negative")
+        self.latch.hold(round(seconds / self.model.opt.timestep))
+
+    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
+        """Picture of the scene for people.
+
+        Returns:
+            `NDArray[np.uint8]`: picture, shape `(render_size, render_size, 3)`.
+        """
+        return self._renderer("view").draw(self.data)
+
+    def close(self) -> None:
+        """Frees the renderers."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+
+    def _command(self, target: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
+        # The target's own velocity is fed forward, so that a free arm follows closely although its gains are
+        # soft and a gap between command and measurement means that something blocks it.
+        control = target + self._servo_lag * velocity
+        control[-1] *= GRIPPER_STROKE
+        self.data.ctrl[self._actuators] = control
+
+    def _check_physics(self) -> None:
+        if not np.isfinite(self.data.qpos).all() or any(self.data.warning.number):
+            names = [mujoco.mjtWarning(i).name for i in np.flatnonzero(self.data.warning.number)]
+            raise RuntimeError(
+                f"the physics diverged at {self.data.time:.2f} s ({', '.join(names) or 'state is not finite'}); "
+                "reset the environment"
+            )
+
+    def _observation(self) -> dict[str, Any]:
+        return {
+            "pixels": {"front": self._renderer("front").draw(self.data)},
+            "agent_pos": self.measured_joints().astype(np.float32),
+        }
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "is_success": self.latch.is_open,
+            "door_kind": self.latch.kind,
+            "opening": self.latch.opening,
+            "attempts": self.latch.attempts,
+        }
+
+    def _renderer(self, camera: str) -> Renderer:
+        if camera not in self._renderers:
+            size, fine = (self.observation_size, False) if camera == "front" else (self.render_size, True)
+            self._renderers[camera] = make_renderer(self.model, camera, size, fine)
+        return self._renderers[camera]
+
+
+def _check_kind(kind: str) -> None:
+    if kind not in (*KINDS, "random"):
+        raise ValueError(f"kind={kind!r} is unknown; choose one of {(*KINDS, 'random')}")
+
+
+def _check_range(name: str, value: float, low: float, high: float, unit: str) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{name}={value!r} is out of range; it must lie within {low} to {high} {unit}")

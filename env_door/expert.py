@@ -1,0 +1,220 @@
+"""The scripted demonstrator: plans tool poses from the knob's place and turns them into joint targets.
+
+The plan is approach, advance, grasp, twist, then for every direction but the last a short try and the way
+back, then the opening motion. Everything before the first try depends on the seed and the door's place only,
+never on its kind.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from env_door.env import GRASP_ROTATION, DoorEnv
+from env_door.kinematics import rotation_about
+from env_door.latch import KINDS
+from env_door.scene import GRIPPER_STROKE
+
+TWIST_ANGLE = 0.95
+"""Twist of the knob in rad; the latch lets go past 0.7."""
+
+GRASP_CLOSURE = 1.0 - (0.028 - 0.005) / GRIPPER_STROKE
+"""Gripper target on the knob's 28 mm bar: 5 mm tighter gives full grip force, yet stays near what is measured."""
+
+STANDOFF = 0.08
+"""Distance in metres from the knob at which the approach ends and the straight advance begins."""
+
+HINGE_FROM_KNOB = np.array([0.086, 0.34, 0.0])
+"""From the knob to the hinge's axis, in metres."""
+
+OPEN_ANGLE = 0.52
+"""Turn of a hinged door in rad at the end of the opening motion."""
+
+OPEN_DISTANCE = 0.19
+"""Travel of a sliding door in metres at the end of the opening motion."""
+
+PROBE_DISTANCE = 0.03
+"""Travel of the tool in metres when a direction is only tried."""
+
+TRY_AXES = {
+    "push": np.array([1.0, 0.0, 0.0]),
+    "pull": np.array([-1.0, 0.0, 0.0]),
+    "slide": np.array([0.0, 1.0, 0.0]),
+}
+"""Along which axis a try moves the tool. Unlike the opening motion a try does not turn the tool with the door: turned
+against a door that stays shut, the pads would slip on the knob and load it the other way on the return."""
+
+PHASE_STEPS = {
+    "approach": (20, 24),
+    "advance": (9, 11),
+    "grasp": (7, 8),
+    "twist": (19, 21),
+    "try": (7, 9),
+    "return": (8, 10),
+    "open": (42, 48),
+}
+"""Shortest and longest duration of each phase in control steps; the rng draws between them."""
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A tool pose told by how far each part of the task has gone.
+
+    Args:
+        shift (`NDArray[np.float64]`):
+            Tool position relative to the closed door's knob in m, before any opening motion, shape `(3,)`.
+        twist (`float`, *optional*, defaults to `0.0`):
+            Twist of the gripper about the knob's axis in rad.
+        gripper (`float`, *optional*, defaults to `0.0`):
+            Gripper target, 0 open to 1 closed.
+        travel (`float`, *optional*, defaults to `0.0`):
+            Opening motion along `direction`, in rad (push, pull) or m (slide).
+        direction (`str`, *optional*, defaults to `"push"`):
+            The direction in which `travel` counts.
+    """
+
+    shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    twist: float = 0.0
+    gripper: float = 0.0
+    travel: float = 0.0
+    direction: str = "push"
+
+    def towards(self, end: "Waypoint", fraction: float) -> "Waypoint":
+        """The waypoint at a fraction of the way to another one."""
+        return Waypoint(
+            shift=self.shift + fraction * (end.shift - self.shift),
+            twist=self.twist + fraction * (end.twist - self.twist),
+            gripper=self.gripper + fraction * (end.gripper - self.gripper),
+            travel=self.travel + fraction * (end.travel - self.travel),
+            direction=end.direction,
+        )
+
+    def pose(self, knob: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Tool pose in the world.
+
+        Args:
+            knob (`NDArray[np.float64]`):
+                Position of the closed door's knob in m, shape `(3,)`.
+
+        Returns:
+            `tuple[NDArray, NDArray]`: position in m `(3,)` and rotation matrix `(3, 3)`.
+        """
+        position = knob + self.shift
+        rotation = rotation_about(np.array([1.0, 0.0, 0.0]), self.twist) @ GRASP_ROTATION
+        if self.direction == "slide":
+            return position + np.array([0.0, self.travel, 0.0]), rotation
+        turn = rotation_about(np.array([0.0, 0.0, 1.0]), self.travel if self.direction == "push" else -self.travel)
+        hinge = knob + HINGE_FROM_KNOB
+        return hinge + turn @ (position - hinge), turn @ rotation
+
+
+class DoorExpert:
+    """Opens the door, after trying wrong directions first where told to.
+
+    Args:
+        env (`DoorEnv`):
+            The unwrapped environment. The expert reads the knob's place from it, but not the kind of door.
+        directions (`Sequence[str]`, *optional*, defaults to `("push",)`):
+            Directions to try in order, each one of `KINDS`; the last one is carried through.
+
+    Raises:
+        ValueError: If there is no direction, or an unknown one.
+    """
+
+    def __init__(self, env: DoorEnv, directions: Sequence[str] = ("push",)):
+        if not directions or any(direction not in KINDS for direction in directions):
+            raise ValueError(f"directions={tuple(directions)} must name at least one of {KINDS} and nothing else")
+        self._env = env
+        self.directions = tuple(directions)
+        self._plan: list[tuple[str, NDArray[np.float32]]] = []
+        self._step = 0
+        self.branch_step = 0
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Plans for the present start pose and door place; call after the environment's `reset`.
+
+        Args:
+            rng (`np.random.Generator`):
+                Draws the duration of every phase. The same number of draws is made before the first try
+                whatever the directions, so equal seeds give equal actions up to `branch_step`.
+
+        Raises:
+            UnreachableError: If the arm cannot reach a pose of the plan.
+        """
+        data, kinematics = self._env.data, self._env.kinematics
+        knob = data.site("knob").xpos.copy()
+        joints = self._env.measured_joints()[:-1]
+        start = kinematics.forward(joints)[0] - knob
+        self._plan = []
+        self._step = 0
+        for phase, begin, end in self._stages(Waypoint(shift=start)):
+            low, high = PHASE_STEPS[phase.split("_")[0]]
+            num_steps = int(rng.integers(low, high + 1))
+            for step in range(1, num_steps + 1):
+                waypoint = begin.towards(end, ease(step / num_steps))
+                joints = kinematics.solve(*waypoint.pose(knob), joints)
+                self._plan.append((phase, np.append(joints, waypoint.gripper).astype(np.float32)))
+            if phase == "twist":
+                self.branch_step = len(self._plan)
+
+    def act(self) -> NDArray[np.float32]:
+        """Target for this control step.
+
+        Returns:
+            `NDArray[np.float32]`: joint targets in rad and gripper target; the last one again once the plan
+            is done.
+
+        Raises:
+            RuntimeError: If `reset` was not called.
+        """
+        if not self._plan:
+            raise RuntimeError("the expert has no plan yet; call reset(rng) after the environment's reset")
+        action = self._plan[min(self._step, len(self._plan) - 1)][1]
+        self._step += 1
+        return action.copy()
+
+    @property
+    def phase(self) -> str:
+        """`str`: phase of the step that `act` returns next: approach, advance, grasp, twist, try_<direction>, return,
+        open, or hold once the plan is done."""
+        return self._plan[self._step][0] if self._step < len(self._plan) else "hold"
+
+    def _stages(self, start: Waypoint) -> list[tuple[str, Waypoint, Waypoint]]:
+        standoff = Waypoint(shift=np.array([-STANDOFF, 0.0, 0.0]))
+        around = Waypoint()
+        grasped = replace(around, gripper=GRASP_CLOSURE)
+        twisted = replace(grasped, twist=TWIST_ANGLE)
+        stages = [
+            ("approach", start, standoff),
+            ("advance", standoff, around),
+            ("grasp", around, grasped),
+            ("twist", grasped, twisted),
+        ]
+        for direction in self.directions[:-1]:
+            tried = replace(twisted, shift=PROBE_DISTANCE * TRY_AXES[direction])
+            stages += [(f"try_{direction}", twisted, tried), ("return", tried, twisted)]
+        last = self.directions[-1]
+        opened = replace(twisted, direction=last, travel=OPEN_DISTANCE if last == "slide" else OPEN_ANGLE)
+        stages.append(("open", replace(twisted, direction=last), opened))
+        return stages
+
+
+def ease(fraction: float, ramp: float = 0.25) -> float:
+    """Trapezoidal speed profile: even acceleration, cruise, even braking.
+
+    Args:
+        fraction (`float`):
+            Elapsed part of the duration, 0 to 1.
+        ramp (`float`, *optional*, defaults to `0.25`):
+            Part of the duration spent accelerating, and again braking.
+
+    Returns:
+        `float`: covered part of the way, 0 to 1.
+    """
+    cruise = 1.0 / (1.0 - ramp)
+    if fraction < ramp:
+        return 0.5 * cruise * fraction**2 / ramp
+    if fraction > 1.0 - ramp:
+        return 1.0 - 0.5 * cruise * (1.0 - fraction) ** 2 / ramp
+    return cruise * (fraction - 0.5 * ramp)

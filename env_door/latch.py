@@ -1,0 +1,203 @@
+"""When the door moves, and which way: the secret of the task.
+
+Three rules make the doors indistinguishable until somebody tries them:
+
+1. One model serves every kind of door. The panel has a slide and a hinge joint, both locked by the same two equality
+   constraints, with the same ranges, so the physics before the first try is bit-identical.
+2. Twisting the knob past `UNLATCH_ANGLE` frees nothing. It only permits rule 3.
+3. A lock opens once the unlatched panel has been loaded in the direction that its kind opens, past a threshold, for
+   0.2 s. The load is the force with which the lock's constraint holds the panel against the robot.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+KINDS = ("push", "pull", "slide")
+"""Kinds of door, which are also the directions in which a robot can try to open one."""
+
+UNLATCH_ANGLE = 0.7
+"""Twist of the knob in rad beyond which the latch lets go."""
+
+LOAD_STEPS = 100
+"""Physics steps (of 2 ms) for which a load must last: a robot that trembles tries nothing, one that pushes does."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How one kind of door opens.
+
+    Args:
+        joint (`str`):
+            The panel's joint that moves.
+        sign (`int`):
+            Which way it moves.
+        break_load (`float`):
+            Load that frees it, in N m (hinge) or N (slide).
+        threshold (`float`):
+            Travel in rad (hinge) or m (slide) that counts as open.
+        limit (`float`):
+            Travel at which the door meets its stop, in rad or m.
+        still_speed (`float`):
+            Speed in rad/s or m/s below which the door counts as nearly still.
+    """
+
+    joint: str
+    sign: int
+    break_load: float
+    threshold: float
+    limit: float
+    still_speed: float
+
+
+OPENINGS = {
+    "push": Opening("hinge", +1, break_load=10.0, threshold=0.40, limit=0.8, still_speed=0.15),
+    "pull": Opening("hinge", -1, break_load=10.0, threshold=0.40, limit=0.8, still_speed=0.15),
+    "slide": Opening("slide", +1, break_load=12.0, threshold=0.14, limit=0.24, still_speed=0.05),
+}
+
+
+class Latch:
+    """Locks of the panel of one scene.
+
+    Args:
+        model (`mujoco.MjModel`):
+            The scene. The ranges of the panel's joints are changed when the door is freed and restored by
+            `reset`.
+        data (`mujoco.MjData`):
+            Its state.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._model = model
+        self._data = data
+        joints = ("slide", "hinge")
+        self._lock = {joint: int(model.equality(f"lock_{joint}").id) for joint in joints}
+        self._joint = {joint: int(model.joint(joint).id) for joint in joints}
+        self._qpos = {joint: int(model.joint(joint).qposadr[0]) for joint in joints}
+        self._qvel = {joint: int(model.joint(joint).dofadr[0]) for joint in joints}
+        self._knob = int(model.joint("knob").qposadr[0])
+        self._closed_ranges = {joint: model.jnt_range[i].copy() for joint, i in self._joint.items()}
+        self.reset("push")
+
+    def reset(self, kind: str) -> None:
+        """Closes and locks the door, and makes it one of the given kind. Call after `mujoco.mj_resetData`.
+
+        Args:
+            kind (`str`):
+                One of `KINDS`.
+
+        Raises:
+            ValueError: If the kind is unknown.
+        """
+        if kind not in KINDS:
+            raise ValueError(f"kind={kind!r} is unknown; choose one of {KINDS}")
+        self.kind = kind
+        self.freed = False
+        self.attempts: tuple[str, ...] = ()
+        self._loaded_steps = dict.fromkeys(KINDS, 0)
+        self._held_steps = 0
+        for joint, index in self._joint.items():
+            self._model.jnt_range[index] = self._closed_ranges[joint]
+            self._lock_at(joint, 0.0)
+
+    @property
+    def unlatched(self) -> bool:
+        """`bool`: whether the knob is twisted far enough for the door to open."""
+        return bool(self._data.qpos[self._knob] > UNLATCH_ANGLE)
+
+    @property
+    def travel(self) -> float:
+        """`float`: how far the door has moved its own way, in rad (hinge) or m (slide)."""
+        opening = OPENINGS[self.kind]
+        return opening.sign * float(self._data.qpos[self._qpos[opening.joint]])
+
+    @property
+    def opening(self) -> float:
+        """`float`: travel as a fraction of the threshold: 0 closed, 1 far enough to count as open, more beyond it."""
+        # A locked panel gives way by some 1e-5 rad, of which each kind would tell another part.
+        return max(0.0, self.travel) / OPENINGS[self.kind].threshold if self.freed else 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """`bool`: whether the door has opened past its threshold and is nearly still."""
+        opening = OPENINGS[self.kind]
+        speed = abs(float(self._data.qvel[self._qvel[opening.joint]]))
+        return self.opening >= 1.0 and speed <= opening.still_speed
+
+    def load(self, direction: str) -> float:
+        """Load with which the robot works on a lock, as a fraction of the load that would free such a door.
+
+        Args:
+            direction (`str`):
+                One of `KINDS`.
+
+        Returns:
+            `float`: the fraction; negative when loaded the other way, 0 where that joint is not locked.
+        """
+        opening = OPENINGS[direction]
+        equality = self._lock[opening.joint]
+        if not self._data.eq_active[equality]:
+            return 0.0
+        # Every equality of the scene couples joints, which makes one constraint row each, in the order of
+        # their ids.
+        row = int(np.count_nonzero(self._data.eq_active[:equality]))
+        return -opening.sign * float(self._data.efc_force[row]) / opening.break_load
+
+    def hold(self, num_steps: int) -> None:
+        """Holds the panel where it is: interference by a person at the other side of the door.
+
+        Args:
+            num_steps (`int`):
+                Physics steps for which to hold it; replaces a hold that still lasts.
+
+        Raises:
+            ValueError: If the number is negative.
+        """
+        if num_steps < 0:
+            raise ValueError(f"num_steps={num_steps} must not be negative")
+        self._held_steps = num_steps
+        if self.freed and num_steps > 0:
+            joint = OPENINGS[self.kind].joint
+            self._lock_at(joint, float(self._data.qpos[self._qpos[joint]]))
+
+    def update(self) -> None:
+        """Looks at the loads after one physics step; frees the door when it is loaded its own way."""
+        held = self._held_steps > 0
+        if held:
+            self._held_steps -= 1
+        if self.freed:
+            if held and self._held_steps == 0:
+                self._data.eq_active[self._lock[OPENINGS[self.kind].joint]] = 0
+            return
+        if not self.unlatched:
+            self._loaded_steps = dict.fromkeys(KINDS, 0)
+            return
+        loads = {direction: self.load(direction) for direction in KINDS}
+        # A sideways load on the knob also turns the hinge a little: the strongest load tells what is being
+        # tried.
+        strongest = max(KINDS, key=loads.__getitem__)
+        for direction in KINDS:
+            tried = direction == strongest and loads[direction] >= 1.0
+            self._loaded_steps[direction] = self._loaded_steps[direction] + 1 if tried else 0
+        if self._loaded_steps[strongest] >= LOAD_STEPS:
+            self._record(strongest)
+            if strongest == self.kind and not held:
+                self._free()
+
+    def _record(self, direction: str) -> None:
+        if not self.attempts or self.attempts[-1] != direction:
+            self.attempts += (direction,)
+
+    def _free(self) -> None:
+        opening = OPENINGS[self.kind]
+        self.freed = True
+        self._data.eq_active[self._lock[opening.joint]] = 0
+        limits = (0.0, opening.limit) if opening.sign > 0 else (-opening.limit, 0.0)
+        self._model.jnt_range[self._joint[opening.joint]] = limits
+
+    def _lock_at(self, joint: str, position: float) -> None:
+        equality = self._lock[joint]
+        self._model.eq_data[equality, 0] = position
+        self._data.eq_active[equality] = 1

@@ -1,0 +1,276 @@
+"""Record the scripted expert into a LeRobotDataset.
+
+Demonstrations are matched by default: the kinds share their seeds for start pose, door position and timing, so that
+nothing before the first opening motion tells which door it is. A policy trained on unmatched demonstrations learns
+such accidents, "knows" its door and tries no other.
+
+The episodes that share a seed are saved together, in one atomic step (see [`~env_door.staging`]): whatever stops a
+recording, the dataset on disk is readable and holds whole, matched episodes.
+"""
+
+import contextlib
+import json
+import logging
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import av
+from lerobot.datasets.io_utils import SuppressProgressBars
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from tqdm import tqdm
+
+from env_door.demonstration import Demonstration, demonstrate
+from env_door.env import DoorEnv
+from env_door.recording_config import ROBOT_TYPES, RecordConfig
+from env_door.staging import StagedDirectory
+
+logger = logging.getLogger(__name__)
+
+CAMERA = f"{OBS_IMAGES}.front"
+PROVENANCE_PATH = Path("meta/door_recording.json")
+MAX_DROPS_IN_A_ROW = 20
+
+
+@dataclass
+class RecordReport:
+    """What a recording did.
+
+    Args:
+        root (`Path`):
+            Folder of the dataset.
+        episodes (`list[dict]`):
+            For each episode saved by this run its `episode_index`, `kind`, `seed`, `branch_step` (first step whose
+            action depends on the kind) and `success_step`.
+        total_episodes (`int`):
+            Episodes in the dataset, with those of earlier runs.
+        dropped_seeds (`list[int]`):
+            Seeds at which the expert failed at one kind, with those of earlier runs.
+        seconds (`float`):
+            Duration of this run.
+    """
+
+    root: Path
+    episodes: list[dict[str, Any]] = field(default_factory=list)
+    total_episodes: int = 0
+    dropped_seeds: list[int] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+@dataclass
+class Provenance:
+    """How the episodes of a dataset came about; kept beside its metadata so that a recording can go on.
+
+    Args:
+        settings (`dict`):
+            Options that all episodes share.
+        episodes (`list[dict]`):
+            `kind` and `seed` of each episode.
+        dropped_seeds (`list[int]`):
+            Seeds that were tried and not used.
+    """
+
+    settings: dict[str, Any]
+    episodes: list[dict[str, Any]] = field(default_factory=list)
+    dropped_seeds: list[int] = field(default_factory=list)
+
+    @property
+    def next_seed(self) -> int:
+        """First seed that has not been tried."""
+        used = [episode["seed"] for episode in self.episodes] + self.dropped_seeds
+        return max(used, default=self.settings["seed"] - 1) + 1
+
+
+def record(config: RecordConfig) -> RecordReport:
+    """Record demonstrations of the scripted expert, push the dataset to the Hub if asked, and report.
+
+    Args:
+        config (`RecordConfig`):
+            What to record, and where to.
+
+    Returns:
+        `RecordReport`: What was saved and what was dropped.
+
+    Raises:
+        FileExistsError: If the folder holds something and `resume` is off.
+        ValueError: If an option does not fit the environment or the dataset to go on with.
+        RuntimeError: If the expert keeps failing, or the upload fails; the dataset on disk stays whole.
+    """
+    start = time.perf_counter()
+    env = DoorEnv(kind=config.kinds[0], arm=config.arm, door_offset=config.door_offset)
+    try:
+        with StagedDirectory(config.path) as directory:
+            provenance = _open(config)
+            report = RecordReport(config.path, dropped_seeds=provenance.dropped_seeds)
+            try:
+                _record_missing(config, env, directory, provenance, report)
+            except (Exception, KeyboardInterrupt):
+                if provenance.episodes:
+                    logger.warning(
+                        f"Recording stopped: {len(provenance.episodes)} of {config.total_episodes} episodes are safe "
+                        f"in {config.path}. Go on with the same command and --resume=true."
+                    )
+                raise
+    finally:
+        env.close()
+    report.total_episodes = len(provenance.episodes)
+    report.seconds = time.perf_counter() - start
+    logger.info(
+        f"{len(report.episodes)} episodes saved to {config.path} in {report.seconds:.0f} s "
+        f"({report.total_episodes} in all, {len(report.dropped_seeds)} seeds dropped)."
+    )
+    if config.push_to_hub:
+        _push(config)
+    return report
+
+
+def _open(config: RecordConfig) -> Provenance:
+    root = config.path
+    settings = json.loads(json.dumps(config.settings))
+    if not root.exists() or not any(root.iterdir()):
+        return Provenance(settings)
+    if not config.resume:
+        raise FileExistsError(
+            f"{root} is not empty. Use --resume=true to go on with the recording in it, or choose another root."
+        )
+    try:
+        provenance = Provenance(**json.loads((root / PROVENANCE_PATH).read_text()))
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"{root} holds no recording of the door to go on with: {PROVENANCE_PATH} is missing. Choose another root."
+        ) from error
+    for name, value in settings.items():
+        if provenance.settings.get(name) != value:
+            raise ValueError(
+                f"{root} was recorded with {name}={provenance.settings.get(name)}, now {name}={value} is asked for. "
+                "Go on with the recorded value, or choose another root."
+            )
+    return provenance
+
+
+def _record_missing(
+    config: RecordConfig,
+    env: DoorEnv,
+    directory: StagedDirectory,
+    provenance: Provenance,
+    report: RecordReport,
+) -> None:
+    done = len(provenance.episodes)
+    with tqdm(total=config.total_episodes, initial=done, desc="Recording", unit="episode") as progress:
+        while len(provenance.episodes) < config.total_episodes:
+            group = _demonstrate_group(config, env, provenance, progress)
+            sources = [{"kind": demonstration.kind, "seed": demonstration.seed} for demonstration in group]
+            with directory.change() as staged:
+                _write_episodes(config, env, staged, group)
+                after = replace(provenance, episodes=provenance.episodes + sources)
+                (staged / PROVENANCE_PATH).write_text(json.dumps(asdict(after), indent=4))
+            for demonstration in group:
+                report.episodes.append(
+                    {
+                        "episode_index": len(provenance.episodes),
+                        "kind": demonstration.kind,
+                        "seed": demonstration.seed,
+                        "branch_step": demonstration.branch_step,
+                        "success_step": demonstration.success_step,
+                    }
+                )
+                provenance.episodes.append({"kind": demonstration.kind, "seed": demonstration.seed})
+            progress.update(len(group))
+
+
+def _demonstrate_group(
+    config: RecordConfig, env: DoorEnv, provenance: Provenance, progress: tqdm
+) -> list[Demonstration]:
+    """Run the expert until it succeeds at one seed with every kind that shares the seed."""
+    kinds = config.kinds
+    if not config.matched:
+        kinds = [kinds[len(provenance.episodes) % len(kinds)]]
+    for _ in range(MAX_DROPS_IN_A_ROW):
+        seed = provenance.next_seed
+        group = []
+        for kind in kinds:
+            demonstration = demonstrate(env, kind, seed, config.num_steps)
+            if demonstration is None:
+                break
+            group.append(demonstration)
+        else:
+            return group
+        provenance.dropped_seeds.append(seed)
+        progress.set_postfix(dropped=len(provenance.dropped_seeds))
+    raise RuntimeError(
+        f"The expert failed at {MAX_DROPS_IN_A_ROW} seeds in a row, {seed} the last. With num_steps="
+        f"{config.num_steps} it may lack the time to open the door; 150 is enough for every kind."
+    )
+
+
+def _write_episodes(config: RecordConfig, env: DoorEnv, root: Path, group: list[Demonstration]) -> None:
+    # LeRobot hands libav's messages over to the terminal, at libav's own level.
+    av.logging.set_libav_level(av.logging.ERROR)
+    options = {
+        "root": root,
+        "rgb_encoder": config.rgb_encoder,
+        # LeRobot's way over image files passes over those that it could not write; the stream to the encoder does not,
+        # and it drops no frame when its queue holds the whole episode.
+        "streaming_encoding": True,
+        "encoder_queue_maxsize": config.num_steps + 1,
+        "encoder_threads": 1,
+        # LeRobot's own choice warns at length where torchcodec is installed but cannot load.
+        "video_backend": "pyav",
+    }
+    if root.exists():
+        dataset = LeRobotDataset.resume(config.repo_id, **options)
+    else:
+        dataset = LeRobotDataset.create(
+            config.repo_id,
+            fps=env.metadata["render_fps"],
+            features=_features(config, env),
+            robot_type=ROBOT_TYPES[config.arm],
+            **options,
+        )
+    try:
+        for demonstration in group:
+            for image, state, action in zip(
+                demonstration.images, demonstration.states, demonstration.actions, strict=True
+            ):
+                dataset.add_frame({CAMERA: image, OBS_STATE: state, ACTION: action, "task": env.task_description})
+            with SuppressProgressBars():
+                dataset.save_episode()
+    except BaseException:
+        # Close the files before their folder goes; what they hold is thrown away with it.
+        with contextlib.suppress(Exception):
+            dataset.finalize()
+        raise
+    dataset.finalize()
+    _check_video(root, num_frames=len(group) * config.num_steps)
+
+
+def _check_video(root: Path, num_frames: int) -> None:
+    newest = max((root / "videos" / CAMERA).rglob("*.mp4"))
+    with av.open(str(newest)) as video:
+        found = video.streams.video[0].frames
+    if found != num_frames:
+        raise RuntimeError(f"The encoder wrote {found} of {num_frames} frames; the episodes were thrown away.")
+
+
+def _features(config: RecordConfig, env: DoorEnv) -> dict[str, dict[str, Any]]:
+    joints = [f"{name}.pos" for name in env.joint_names]
+    vector = {"dtype": "float32", "shape": (len(joints),), "names": joints}
+    image = {
+        "dtype": "video",
+        "shape": (env.observation_size, env.observation_size, 3),
+        "names": ["height", "width", "channels"],
+    }
+    return {OBS_STATE: vector, ACTION: dict(vector), CAMERA: image}
+
+
+def _push(config: RecordConfig) -> None:
+    try:
+        dataset = LeRobotDataset(config.repo_id, root=config.path, video_backend="pyav")
+        dataset.push_to_hub(tags=config.tags, private=config.private)
+    except Exception as error:
+        raise RuntimeError(
+            f"Uploading {config.repo_id} failed: {error}\nThe dataset is complete in {config.path}. "
+            "Upload it later with the same command and --resume=true."
+        ) from error

@@ -1,0 +1,130 @@
+"""What to record: the options of the recorder."""
+
+import re
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub.utils import HFValidationError, validate_repo_id
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.utils.constants import HF_LEROBOT_HOME
+
+from env_door.latch import KINDS
+
+ROBOT_TYPES = {"ur5e": "ur5e_robotiq", "panda": "panda"}
+# Options that may change between the runs that make up one dataset.
+FREE_OPTIONS = ("repo_id", "root", "episodes_per_kind", "push_to_hub", "private", "tags", "resume")
+
+
+@dataclass
+class FrameEncoderConfig(RGBEncoderConfig):
+    """Encoder that codes every frame alone, at a constant quantiser and with full colour resolution.
+
+    A decoded frame is then a function of the rendered frame and of nothing else: no later frame, which would show
+    the kind of the door, leaves a trace in an earlier one. Any frame is decoded without its neighbours, too. The usual
+    halved colour resolution blurs the small coloured parts of a 128-pixel image, which a policy sees sharp at run time.
+    """
+
+    vcodec: str = "h264"
+    pix_fmt: str = "yuv444p"
+    g: int | None = 1
+    crf: int | float | None = None
+    fast_decode: int = 1
+    extra_options: dict[str, Any] = field(default_factory=lambda: {"qp": 20})
+
+
+@dataclass
+class RecordConfig:
+    """What to record, and where to.
+
+    Args:
+        repo_id (`str`):
+            Name of the dataset, `{hf_username}/{dataset_name}`.
+        root (`str | Path | None`, *optional*):
+            Folder of the dataset; defaults to `$HF_LEROBOT_HOME/{repo_id}`.
+        episodes_per_kind (`int`, *optional*, defaults to 5):
+            Episodes to save for each kind of door.
+        kinds (`list[str]`, *optional*, defaults to `["push", "pull", "slide"]`):
+            Kinds of door to record.
+        arm (`str`, *optional*, defaults to `"ur5e"`):
+            `"ur5e"` or `"panda"`.
+        door_offset (`float`, *optional*, defaults to 0.0):
+            Half-width, in metres, of the range from which the lateral shift of the door is drawn; 0 to 0.05.
+        seed (`int`, *optional*, defaults to 0):
+            First seed; the following episodes count up from it.
+        matched (`bool`, *optional*, defaults to `True`):
+            Use the same seeds for every kind.
+        num_steps (`int`, *optional*, defaults to 150):
+            Frames of an episode, at 10 Hz.
+        rgb_encoder (`FrameEncoderConfig`, *optional*):
+            Video encoder; by default one that keeps the kind of the door out of earlier frames.
+        push_to_hub (`bool`, *optional*, defaults to `False`):
+            Upload the dataset once it is complete.
+        private (`bool | None`, *optional*):
+            Upload as a private dataset; `None` leaves it to the Hub's default.
+        tags (`list[str] | None`, *optional*):
+            Tags of the dataset on the Hub.
+        resume (`bool`, *optional*, defaults to `False`):
+            Go on with an interrupted recording, or extend a finished one.
+
+    Raises:
+        ValueError: If a field is out of its range.
+    """
+
+    repo_id: str
+    root: str | Path | None = None
+    episodes_per_kind: int = 5
+    kinds: list[str] = field(default_factory=lambda: list(KINDS))
+    arm: str = "ur5e"
+    door_offset: float = 0.0
+    seed: int = 0
+    matched: bool = True
+    num_steps: int = 150
+    rgb_encoder: FrameEncoderConfig = field(default_factory=FrameEncoderConfig)
+    push_to_hub: bool = False
+    private: bool | None = None
+    tags: list[str] | None = None
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        _check_repo_id(self.repo_id)
+        if self.episodes_per_kind < 1:
+            raise ValueError(f"episodes_per_kind must be at least 1, got {self.episodes_per_kind}.")
+        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        if unknown or not self.kinds:
+            raise ValueError(f"kinds must be one or more of {', '.join(KINDS)}, got {self.kinds}.")
+        if len(set(self.kinds)) != len(self.kinds):
+            raise ValueError(f"kinds must not repeat, got {self.kinds}.")
+        if self.arm not in ROBOT_TYPES:
+            raise ValueError(f"arm must be one of {', '.join(ROBOT_TYPES)}, got {self.arm!r}.")
+        if self.seed < 0:
+            raise ValueError(f"seed must be 0 or more, got {self.seed}.")
+        if self.num_steps < 1:
+            raise ValueError(f"num_steps must be at least 1, got {self.num_steps}.")
+
+    @property
+    def path(self) -> Path:
+        """Folder of the dataset."""
+        return Path(self.root).expanduser().resolve() if self.root else HF_LEROBOT_HOME / self.repo_id
+
+    @property
+    def total_episodes(self) -> int:
+        """Episodes of the complete dataset."""
+        return self.episodes_per_kind * len(self.kinds)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The options that every episode of a dataset must share."""
+        return {name: value for name, value in asdict(self).items() if name not in FREE_OPTIONS}
+
+
+def _check_repo_id(repo_id: str) -> None:
+    wanted = "repo_id must read {hf_username}/{dataset_name}, for example my-name/door"
+    try:
+        validate_repo_id(repo_id)
+    except HFValidationError as error:
+        raise ValueError(f"{wanted}: {error}") from error
+    if "/" not in repo_id:
+        raise ValueError(f"{wanted}; got {repo_id!r}.")
+    if re.search("/eval_", repo_id):
+        raise ValueError(f"Dataset names starting with 'eval_' are reserved for evaluations, got {repo_id!r}.")

@@ -1,0 +1,144 @@
+"""One JSON line for every finished trial, and the reader of that log.
+
+Stock `lerobot-eval` keeps only the success of a trial. What this task is about, whether the door was opened at
+the first try or after a wrong one, is in the environment's `info` and would be lost: `TrialLog` writes it down.
+"""
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What happened in one trial.
+
+    Args:
+        seed (`int | None`):
+            Seed that the environment was reset with; `None` when it was reset without one.
+        door_kind (`str`):
+            Kind of the door: `"push"`, `"pull"` or `"slide"`.
+        success (`bool`):
+            Whether the door was opened.
+        steps (`int`):
+            Control steps taken, 10 a second.
+        attempts (`tuple[str, ...]`):
+            Directions in which the unlatched door was tried, in order.
+        opening (`float`):
+            How far the door stood open at the end, 0 closed, 1 the success threshold.
+        door_offset (`float`):
+            Lateral shift of the door in metres.
+    """
+
+    seed: int | None
+    door_kind: str
+    success: bool
+    steps: int
+    attempts: tuple[str, ...]
+    opening: float
+    door_offset: float
+
+    @property
+    def first_try_wrong(self) -> bool:
+        """Whether the first direction tried was not the door's own."""
+        return bool(self.attempts) and self.attempts[0] != self.door_kind
+
+    @property
+    def first_try(self) -> bool:
+        """Whether the door was opened without a wrong attempt."""
+        return self.success and not self._tried_wrongly
+
+    @property
+    def recovered(self) -> bool:
+        """Whether the door was opened after at least one wrong attempt."""
+        return self.success and self._tried_wrongly
+
+    @property
+    def _tried_wrongly(self) -> bool:
+        return any(attempt != self.door_kind for attempt in self.attempts)
+
+
+class TrialLog(gym.Wrapper):
+    """Append one JSON line to a file for every trial that ends.
+
+    A trial ends when the environment terminates or is truncated; one abandoned by an early reset leaves no line.
+    Each line is a single write, so that parallel environments, also in other processes, may share the file.
+
+    Args:
+        env (`gym.Env`):
+            Door environment that ends its episodes (with a time limit inside).
+        path (`str | Path`):
+            File to append to; it and its folder are made when missing.
+    """
+
+    def __init__(self, env: gym.Env, path: str | Path):
+        super().__init__(env)
+        self._path = Path(path)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._seed: int | None = None
+        self._steps = 0
+        self._finished = True
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Start a new trial; an unfinished one is forgotten."""
+        self._seed, self._steps, self._finished = seed, 0, False
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action):
+        """Step the environment and log the trial when this step ends it."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._steps += 1
+        if (terminated or truncated) and not self._finished:
+            self._finished = True
+            self._append(info)
+        return observation, reward, terminated, truncated, info
+
+    def _append(self, info: dict[str, Any]) -> None:
+        trial = Trial(
+            seed=self._seed,
+            door_kind=info["door_kind"],
+            success=bool(info["is_success"]),
+            steps=self._steps,
+            attempts=tuple(info["attempts"]),
+            opening=float(info["opening"]),
+            door_offset=float(self.get_wrapper_attr("current_offset")),
+        )
+        line = json.dumps(asdict(trial)) + "\n"
+        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            os.write(descriptor, line.encode())
+        finally:
+            os.close(descriptor)
+
+
+def read_trials(path: str | Path) -> list[Trial]:
+    """Read a trial log.
+
+    Args:
+        path (`str | Path`):
+            File written by [`TrialLog`].
+
+    Returns:
+        `list[Trial]`: The trials in the order in which they ended.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If a line is not a trial; the message names the line.
+    """
+    trials = []
+    for number, line in enumerate(Path(path).read_text().splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            fields = json.loads(line)
+            trials.append(Trial(**{**fields, "attempts": tuple(fields["attempts"])}))
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{path}, line {number} is not a trial ({error}): {line[:80]!r}. "
+                "Each line must be a JSON object as written by env_door.trials.TrialLog: remove or repair this one."
+            ) from error
+    return trials

@@ -1,0 +1,119 @@
+"""Success per door with Wilson intervals, first tries and recoveries apart."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from io import StringIO
+
+from scipy.stats import binomtest
+
+from env_door.trials import Trial
+
+HALF_TIME = 150
+"""Steps of a demonstration; a trial may take twice as long, which leaves time to recover from a wrong try."""
+
+
+@dataclass(frozen=True)
+class DoorResult:
+    """Trials on one kind of door, in counts.
+
+    Attributes:
+        kind (`str`): kind of door, or `all`.
+        trials (`int`): number of trials.
+        opened_150 (`int`): opened within 150 steps (15 s).
+        opened_300 (`int`): opened within 300 steps (30 s).
+        first_try (`int`): opened with no wrong direction tried before.
+        first_try_wrong (`int`): trials whose first direction was wrong.
+        recovered (`int`): opened after a wrong direction.
+        untried (`int`): trials in which the unlatched door was never loaded in any direction.
+    """
+
+    kind: str
+    trials: int
+    opened_150: int
+    opened_300: int
+    first_try: int
+    first_try_wrong: int
+    recovered: int
+    untried: int
+
+
+def summarize(trials: Sequence[Trial]) -> list[DoorResult]:
+    """Counts per kind of door, in the order of first appearance, and over all doors.
+
+    Args:
+        trials (`Sequence[Trial]`):
+            Finished trials.
+
+    Returns:
+        `list[DoorResult]`: one row a kind, then `all`.
+
+    Raises:
+        ValueError: If there are no trials.
+    """
+    if not trials:
+        raise ValueError("There are no trials to summarise; run lerobot-eval with --env.trial_log=<file> first.")
+    kinds = list(dict.fromkeys(trial.door_kind for trial in trials))
+    rows = [_count(kind, [trial for trial in trials if trial.door_kind == kind]) for kind in kinds]
+    return [*rows, _count("all", trials)]
+
+
+def _count(kind: str, trials: Sequence[Trial]) -> DoorResult:
+    return DoorResult(
+        kind=kind,
+        trials=len(trials),
+        opened_150=sum(trial.success and trial.steps <= HALF_TIME for trial in trials),
+        opened_300=sum(trial.success and trial.steps <= 2 * HALF_TIME for trial in trials),
+        first_try=sum(trial.first_try for trial in trials),
+        first_try_wrong=sum(trial.first_try_wrong for trial in trials),
+        recovered=sum(trial.recovered for trial in trials),
+        untried=sum(not trial.attempts for trial in trials),
+    )
+
+
+def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson score interval of a success rate.
+
+    Args:
+        successes (`int`):
+            Number of successes.
+        trials (`int`):
+            Number of trials, at least 1.
+        confidence (`float`, *optional*, defaults to `0.95`):
+            Confidence level.
+
+    Returns:
+        `tuple[float, float]`: lower and upper bound, from 0 to 1.
+    """
+    interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def to_markdown(rows: Sequence[DoorResult]) -> str:
+    """The table for people: counts, success rate and its 95 % Wilson interval."""
+
+    def rate(successes: int, trials: int) -> str:
+        if trials == 0:
+            return "-"
+        low, high = wilson_interval(successes, trials)
+        return f"{successes}/{trials} = {successes / trials:.0%} [{low:.0%}, {high:.0%}]"
+
+    lines = [
+        "| door | opened in 15 s | opened in 30 s | at the first try | recovered from a wrong one | no try at all |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        lines.append(
+            f"| {row.kind} | {rate(row.opened_150, row.trials)} | {rate(row.opened_300, row.trials)} "
+            f"| {rate(row.first_try, row.trials)} | {rate(row.recovered, row.first_try_wrong)} | {row.untried} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def to_csv(rows: Sequence[DoorResult]) -> str:
+    """The table for programs: one row a door, counts only."""
+    text = StringIO()
+    writer = csv.DictWriter(text, [column.name for column in fields(DoorResult)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    return text.getvalue()

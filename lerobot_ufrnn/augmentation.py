@@ -1,0 +1,76 @@
+"""Training-time augmentation of images (for the autoencoder) and of whole episodes (for the recurrent network)."""
+
+import torch
+from torch import Generator, Tensor
+
+
+def augment_images(
+    images: Tensor, max_shift: int, colour_jitter: float, noise_std: float, generator: Generator | None = None
+) -> Tensor:
+    """Shifts, recolours and roughens images; the autoencoder must still reconstruct the clean ones.
+
+    Args:
+        images (`Tensor`):
+            Images (B, 3, height, width) in [0, 1].
+        max_shift (`int`):
+            Largest shift in pixels to either side, the same for both axes; borders are repeated.
+        colour_jitter (`float`):
+            Largest relative change of each image's brightness and of each of its colour channels.
+        noise_std (`float`):
+            Standard deviation of the pixel noise.
+        generator (`torch.Generator`, *optional*):
+            Source of randomness.
+
+    Returns:
+        `Tensor`: augmented images in [0, 1], same shape.
+    """
+    batch_size, _, height, width = images.shape
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, device=images.device) * 2 - 1
+
+    if max_shift > 0:
+        padded = torch.nn.functional.pad(images, (max_shift,) * 4, mode="replicate")
+        shift = torch.randint(0, 2 * max_shift + 1, (batch_size, 2), generator=generator, device=images.device)
+        rows = shift[:, :1] + torch.arange(height, device=images.device)  # (B, height)
+        columns = shift[:, 1:] + torch.arange(width, device=images.device)  # (B, width)
+        batch = torch.arange(batch_size, device=images.device)[:, None, None]
+        images = padded.permute(0, 2, 3, 1)[batch, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
+    gain = 1 + colour_jitter * (uniform(batch_size, 1, 1, 1) + uniform(batch_size, 3, 1, 1)) / 2
+    noise = noise_std * torch.randn(images.shape, generator=generator, device=images.device)
+    return (images * gain + noise).clamp(0, 1)
+
+
+def stall_indices(
+    length: int, probability: float, max_steps: int, max_length: int, generator: Generator | None = None
+) -> Tensor:
+    """Time index of an episode that stalls now and then: the same moment is seen for several steps.
+
+    Inputs and targets read through the same index, so that while the observation stands still its target waits too:
+    the next move depends on what is seen, not on how much time has passed.
+
+    Args:
+        length (`int`):
+            Steps L of the episode.
+        probability (`float`):
+            Probability that a stall begins at any step.
+        max_steps (`int`):
+            Longest stall; its length is uniform from 1 to this.
+        max_length (`int`):
+            Longest result. Once stalls have used up `max_length - length` steps, no further one begins.
+        generator (`torch.Generator`, *optional*):
+            Source of randomness.
+
+    Returns:
+        `Tensor`: non-decreasing indices from 0 to L-1, each at least once, int64 (L <= length' <= max_length,).
+    """
+    begins = torch.rand(length, generator=generator) < probability
+    extra = torch.randint(1, max_steps + 1, (length,), generator=generator) * begins
+    # Stalls spend a budget from a random place in the episode, so that a short budget does not favour the beginning.
+    start = int(torch.randint(0, length, (1,), generator=generator))
+    order = (torch.arange(length) + start) % length
+    spent = extra[order].cumsum(0)
+    granted = (spent.clamp(max=max(max_length - length, 0))).diff(prepend=torch.zeros(1, dtype=spent.dtype))
+    repeats = torch.ones(length, dtype=torch.long)
+    repeats[order] += granted
+    return torch.arange(length).repeat_interleave(repeats)

@@ -1,0 +1,426 @@
+"""UFRNNPolicy: LeRobot batches on one side, the networks on the other."""
+
+import logging
+import threading
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from huggingface_hub import hf_hub_download
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Generator, Tensor, nn
+
+from .augmentation import augment_images, stall_indices
+from .configuration_ufrnn import UFRNNConfig
+from .episodes import Episode, EpisodeStore
+from .foresight import Foresight, ForesightTrace, NoiseSchedule, uncertainty
+from .networks import SHLSTM, ImageEncoder, Prediction, RangeScaler, gaussian_nll
+from .recurrent import UFRNN, Memory
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T", bound="UFRNNPolicy")
+
+ENCODER_PREFIX = "image_encoder."
+
+
+class UFRNNPolicy(PreTrainedPolicy):
+    """Uncertainty-driven Foresight RNN (UF-RNN), and its baselines SH-RNN+noise and SH-RNN.
+
+    **Acting.** `select_action` encodes the cameras, scales the measured joints, advances the hidden state by one step,
+    lets foresight refine it and returns the predicted joints as absolute targets. The hidden state lives from `reset`
+    to `reset`; `last_trace` and `memory` show what foresight saw.
+
+    **Training** with stock `lerobot-train` goes through two phases, counted in updates and saved with the checkpoint:
+    first the autoencoder (`autoencoder_steps` updates on frames of the batch's episodes), then, with its features
+    computed once and kept, the recurrent network on whole episodes. An item of a batch only *names* an episode.
+
+    Args:
+        config (`UFRNNConfig`):
+            Policy configuration, with input and output features filled in (`make_policy` does).
+        dataset_stats (`dict[str, dict[str, Tensor]]`, *optional*):
+            Dataset statistics; the smallest and largest joint state and action set the scaling.
+        dataset_meta (`LeRobotDatasetMetadata`, *optional*):
+            Dataset metadata; needed for training.
+        **kwargs:
+            Whatever else LeRobot's factory passes; ignored.
+
+    Raises:
+        ValueError: If the features do not suit the policy or the dataset is empty.
+    """
+
+    config_class = UFRNNConfig
+    name = "ufrnn"
+
+    config: UFRNNConfig
+    updates: Tensor
+    noise_seed: Tensor
+
+    def __init__(
+        self,
+        config: UFRNNConfig,
+        dataset_stats: dict[str, dict[str, Tensor]] | None = None,
+        dataset_meta: Any = None,
+        **kwargs: Any,
+    ):
+        super().__init__(config)
+        config.validate_features()
+        joint_dim = config.action_feature.shape[0]
+        self.image_encoder = ImageEncoder(
+            config.cameras,
+            config.image_size,
+            config.feature_dim,
+            config.conv_channels,
+            config.autoencoder_hidden_dim,
+        )
+        self.joint_scaler = RangeScaler(joint_dim)
+        self.model = UFRNN(
+            SHLSTM(
+                joint_dim,
+                config.feature_dim * len(config.cameras),
+                config.joint_hidden_dim,
+                config.image_hidden_dim,
+                config.shared_hidden_dim,
+                config.log_variance_range,
+            ),
+            Foresight(
+                config.exploration,
+                NoiseSchedule(config.noise_range, config.noise_unit, config.noise_scale == "log"),
+                config.num_samples,
+                config.horizon,
+                config.horizon_mode == "learned",
+                config.perturbed_states,
+                config.variance_baseline,
+                config.variance_aggregation,
+                config.keep_unperturbed,
+            ),
+        )
+        # Training noise is a function of this seed and the update, so that a resumed run goes on exactly as if whole.
+        self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("noise_seed", torch.randint(2**31, ()))
+        if dataset_stats is not None:
+            self._fit_joint_scaler(dataset_stats)
+        self.episodes: EpisodeStore | None = None
+        if dataset_meta is not None:
+            self.episodes = EpisodeStore(dataset_meta, config.cameras, self.image_encoder)
+            config.drop_n_last_frames = _frames_to_drop(self.episodes.lengths)
+        self.reset()
+
+    # ── Acting ────────────────────────────────────────────────────────
+
+    def reset(self) -> None:
+        """Forgets the episode: the next `select_action` starts from the zero state, with any batch size."""
+        self.memory: Memory | None = None
+        self.last_trace: ForesightTrace | None = None
+        self._thread = threading.get_ident()
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Advances every episode of the batch by one step and returns the next joint targets.
+
+        Args:
+            batch (`dict[str, Tensor]`):
+                `observation.state` (B, D_j) in the dataset's units and every camera (B, 3, height, width) in [0, 1].
+
+        Returns:
+            `Tensor`: absolute joint targets, (B, D_j), in the dataset's units.
+
+        Raises:
+            ValueError: If an input is missing, has another shape or holds NaN, or the batch size changes mid-episode.
+            RuntimeError: If two threads share the policy, or it was never trained.
+        """
+        if threading.get_ident() != self._thread:
+            raise RuntimeError(
+                "UF-RNN carries its hidden state from step to step, so one policy cannot run several environments in "
+                "threads. Set --env.max_parallel_tasks=1 (and use --eval.batch_size for parallel episodes)."
+            )
+        self._check_observation(batch)
+        joints = self.joint_scaler.scale(batch[OBS_STATE])
+        features = self.image_encoder({camera: batch[camera] for camera in self.config.cameras})
+        if self.memory is None:
+            self.memory = self.model.initial_memory(len(joints))
+        self.memory, self.last_trace = self.model.advance(torch.cat((joints, features), dim=-1), self.memory)
+        return self.joint_scaler.unscale(self.memory.prediction.mean[:, : self.model.network.joint_dim])
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """One-step chunk (B, 1, D_j) of `select_action`; the policy re-plans at every step by design."""
+        return self.select_action(batch).unsqueeze(1)
+
+    def _check_observation(self, batch: dict[str, Tensor]) -> None:
+        wanted = (OBS_STATE, *self.config.cameras)
+        missing = [key for key in wanted if key not in batch]
+        if missing:
+            raise ValueError(
+                f"The observation lacks {missing}; it has {sorted(key for key in batch if key.startswith(OBS_STR))}. "
+                "Give the cameras the names they had in training, or map them with --rename_map."
+            )
+        batch_size = len(batch[OBS_STATE])
+        for key in wanted:
+            value = batch[key]
+            shape = tuple(self.config.input_features[key].shape)
+            # Images may come in any size: the encoder resizes them.
+            expected = (batch_size, *shape) if key == OBS_STATE else (batch_size, 3, *tuple(value.shape[-2:]))
+            if tuple(value.shape) != expected:
+                raise ValueError(
+                    f"'{key}' must have shape (batch, {', '.join(map(str, shape))}), got {tuple(value.shape)}."
+                )
+            if value.is_floating_point() and not torch.isfinite(value).all():
+                rows = (~torch.isfinite(value.flatten(1))).any(dim=1).nonzero().flatten().tolist()
+                raise ValueError(f"'{key}' holds NaN or infinite values in batch row(s) {rows}; check the sensor.")
+        if self.memory is not None and (running := len(self.memory.state.h_joint)) != batch_size:
+            raise ValueError(
+                f"The batch size changed from {running} to {batch_size} in mid-episode; call reset() at the start of "
+                "each episode."
+            )
+
+    # ── Training ──────────────────────────────────────────────────────
+
+    @property
+    def trains_autoencoder(self) -> bool:
+        """`bool`: whether training is still in its first phase."""
+        return self.config.autoencoder_path is None and int(self.updates) < self.config.autoencoder_steps
+
+    def get_optim_params(self) -> list[dict[str, Any]]:
+        """Parameter groups; the recurrent network first, so that its learning rate is the one LeRobot logs."""
+        return [
+            {"params": list(self.model.parameters())},
+            {"params": list(self.image_encoder.parameters()), "lr": self.config.autoencoder_lr},
+        ]
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Training loss of the current phase.
+
+        Args:
+            batch (`dict[str, Tensor]`):
+                A LeRobot batch; only `episode_index` (B,) is read.
+
+        Returns:
+            `tuple[Tensor, dict[str, float]]`: the loss and what to log.
+
+        Raises:
+            RuntimeError: If the policy was built without a dataset.
+            ValueError: If the batch names no episodes, or an episode is broken.
+        """
+        if self.episodes is None:
+            raise RuntimeError(
+                "Training needs the dataset: build the policy with `make_policy(cfg, ds_meta=dataset.meta)`, as "
+                "lerobot-train does."
+            )
+        if "episode_index" not in batch:
+            raise ValueError(f"A training batch must hold 'episode_index' (B,), got {sorted(batch)}.")
+        if int(self.updates) == 0 and self.config.autoencoder_path is not None and self.training:
+            self._load_autoencoder(self.config.autoencoder_path)
+        episodes = [self.episodes[index] for index in batch["episode_index"].flatten().tolist()]
+        generator = torch.Generator(self.updates.device).manual_seed(int(self.noise_seed) + int(self.updates))
+        if self.trains_autoencoder:
+            return self._autoencoder_loss(episodes, generator)
+        self._finish_autoencoder(self.episodes)
+        episodes = [self.episodes[index] for index in batch["episode_index"].flatten().tolist()]
+        return self._recurrent_loss(episodes, generator)
+
+    def update(self) -> None:
+        """Counts an update; `lerobot-train` calls it after each optimiser step. Closes the autoencoder's phase."""
+        was_training_autoencoder = self.trains_autoencoder
+        self.updates += 1
+        if was_training_autoencoder and not self.trains_autoencoder and self.episodes is not None:
+            self._finish_autoencoder(self.episodes)
+
+    def _finish_autoencoder(self, store: EpisodeStore) -> None:
+        """Encodes all frames once and, where it has none yet, sets the range of the features."""
+        store.encode()
+        if not self.image_encoder.scaler.is_fitted:
+            features = torch.cat([episode.features for episode in store.loaded.values()])
+            self.image_encoder.scaler.fit(features.amin(0), features.amax(0))
+            logger.info("Autoencoder done: %d frames encoded; the recurrent network trains now.", len(features))
+
+    def _autoencoder_loss(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, dict[str, float]]:
+        config, device = self.config, self.updates.device
+        picks = torch.randint(2**31, (config.autoencoder_batch_size,), generator=generator, device=device).tolist()
+        errors = []
+        for camera, autoencoder in self.image_encoder.by_camera():
+            if int(self.updates) == 0 and self.training:
+                all_frames = torch.cat([episode.images[camera] for episode in episodes])
+                autoencoder.fit_background(self.image_encoder.resize(all_frames.to(device)))
+            sources = [episodes[row % len(episodes)].images[camera] for row in range(len(picks))]
+            frames = torch.stack([source[pick % len(source)] for source, pick in zip(sources, picks, strict=True)])
+            clean = self.image_encoder.resize(frames.to(device))
+            noisy = clean
+            if self.training:
+                noisy = augment_images(clean, config.image_shift, config.image_jitter, config.image_noise, generator)
+            errors.append((autoencoder.decode(autoencoder.encode(noisy)) - clean).square().mean())
+        loss = torch.stack(errors).mean()
+        return loss, {"autoencoder_mse": loss.item()}
+
+    def _recurrent_loss(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, dict[str, float]]:
+        inputs, targets, mask = self._sequences(episodes, generator)
+        if self.training:
+            noise = torch.randn(inputs.shape, generator=generator, device=inputs.device)
+            inputs = inputs + self.config.input_noise * noise
+        prediction, traces = self.model(inputs, generator)
+        nll = gaussian_nll(targets, prediction.mean, prediction.log_variance).sum(-1)  # (B, L)
+        loss = nll[mask].mean()
+        variance = self.model.modality_variance(prediction)[mask].detach()  # (M, 2)
+        if self.training:
+            self.model.foresight.schedule.observe(variance)
+        joint_dim = self.model.network.joint_dim
+        error = (targets - prediction.mean).detach().square()[mask]
+        logs = {
+            "nll": loss.item(),
+            "joint_rmse": error[:, :joint_dim].mean().sqrt().item(),
+            "feature_rmse": error[:, joint_dim:].mean().sqrt().item(),
+            "joint_variance": variance[:, 0].mean().item(),
+            "feature_variance": variance[:, 1].mean().item(),
+        }
+        if traces:
+            # How much calmer the kept future is than the average candidate's: 0 would mean that selection does nothing.
+            final = torch.stack([trace.final for trace in traces])  # (L, N, B)
+            logs["foresight_gain"] = (1 - final.amin(1) / final.mean(1)).mean().item()
+            if self.config.horizon_mode == "learned":
+                loss = loss + _horizon_loss(prediction, traces, mask, joint_dim)
+        return loss, logs
+
+    def _sequences(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Scaled inputs and targets (B, L, D) and the mask (B, L) of the steps that exist."""
+        pairs = [self._input_target(episode) for episode in episodes]
+        if self.training and self.config.stall_probability > 0:
+            longest = int(max(len(inputs) for inputs, _ in pairs) * self.config.stall_stretch)
+            cpu = torch.Generator().manual_seed(generator.initial_seed())
+            for row, (inputs, target) in enumerate(pairs):
+                index = stall_indices(
+                    len(inputs), self.config.stall_probability, self.config.stall_steps, longest, cpu
+                ).to(inputs.device)
+                pairs[row] = (inputs[index], target[index])
+        inputs, targets = (nn.utils.rnn.pad_sequence(list(rows), batch_first=True) for rows in zip(*pairs, strict=True))
+        lengths = torch.tensor([len(inputs) for inputs, _ in pairs], device=inputs.device)
+        return inputs, targets, torch.arange(inputs.shape[1], device=inputs.device) < lengths[:, None]
+
+    def _input_target(self, episode: Episode) -> tuple[Tensor, Tensor]:
+        device = self.updates.device
+        states = self.joint_scaler.scale(episode.states.to(device))
+        features = self.image_encoder.scaler.scale(episode.features)
+        joint_target = self.joint_scaler.scale(episode.actions.to(device))[:-1]
+        if self.config.joint_target == "next_state":
+            joint_target = states[1:]
+        return torch.cat((states, features), -1)[:-1], torch.cat((joint_target, features[1:]), -1)
+
+    def _fit_joint_scaler(self, stats: dict[str, dict[str, Tensor]]) -> None:
+        """One range for measured and commanded joints: a command fed back must mean what a measurement means."""
+        try:
+            bounds = [torch.as_tensor(stats[key][bound]) for bound in ("min", "max") for key in (OBS_STATE, ACTION)]
+        except KeyError as error:
+            raise ValueError(
+                f"The dataset's statistics lack {error} (min and max of '{OBS_STATE}' and '{ACTION}' are needed). "
+                "Record the dataset with a current LeRobot, which writes meta/stats.json."
+            ) from error
+        state_low, action_low, state_high, action_high = bounds
+        self.joint_scaler.fit(torch.minimum(state_low, action_low), torch.maximum(state_high, action_high))
+
+    # ── Loading ───────────────────────────────────────────────────────
+
+    @classmethod
+    def _load_as_safetensor(cls: type[T], model: T, model_file: str, map_location: str, strict: bool) -> T:
+        """Loads weights and refuses a broken or foreign file: random layers would look like a bad policy."""
+        weights = _read_weights(model_file)
+        own = model.state_dict()
+        wrong = [
+            *(f"missing {key}" for key in sorted(own.keys() - weights.keys())),
+            *(f"unknown {key}" for key in sorted(weights.keys() - own.keys())),
+            *(
+                f"{key} has shape {tuple(weights[key].shape)} instead of {tuple(own[key].shape)}"
+                for key in sorted(own.keys() & weights.keys())
+                if own[key].shape != weights[key].shape
+            ),
+        ]
+        if wrong:
+            raise ValueError(
+                f"'{model_file}' does not fit this policy's configuration: {'; '.join(wrong[:5])}"
+                f"{' ...' if len(wrong) > 5 else ''}. Load it with the config.json it was saved with."
+            )
+        model.load_state_dict(weights)
+        return model
+
+    def _load_autoencoder(self, path: str) -> None:
+        """Takes image encoder and feature range over from another `ufrnn` checkpoint."""
+        folder = Path(path).expanduser()
+        if folder.is_dir():
+            file = folder / SAFETENSORS_SINGLE_FILE
+        elif folder.exists() or path.count("/") != 1 or path.startswith((".", "/", "~")):
+            raise ValueError(
+                f"`autoencoder_path` must be a checkpoint folder or a Hub repository 'user/name', got '{path}'."
+            )
+        else:
+            file = Path(hf_hub_download(path, SAFETENSORS_SINGLE_FILE))
+        weights = {
+            key.removeprefix(ENCODER_PREFIX): value
+            for key, value in _read_weights(file).items()
+            if key.startswith(ENCODER_PREFIX)
+        }
+        try:
+            self.image_encoder.load_state_dict(weights)
+        except RuntimeError as error:
+            raise ValueError(
+                f"The autoencoder in '{path}' does not fit: it must have the same cameras, image_size, feature_dim and "
+                f"conv_channels as this policy. {error}"
+            ) from error
+        if not self.image_encoder.scaler.is_fitted:
+            raise ValueError(
+                f"The autoencoder in '{path}' is not trained to its end; take a checkpoint of a run with at least "
+                "`autoencoder_steps` updates."
+            )
+        logger.info("Autoencoder taken over from %s.", path)
+
+
+def _read_weights(file: str | Path) -> dict[str, Tensor]:
+    try:
+        return load_file(file)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"There are no weights at '{file}'; give the folder that holds model.safetensors."
+        ) from error
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"'{file}' is broken or not a safetensors file ({error}); copy or download it again."
+        ) from error
+
+
+def _frames_to_drop(lengths: list[int]) -> int:
+    """Frames at each episode's end that LeRobot's sampler leaves out.
+
+    Every frame that it may draw stands for its whole episode. Equal lengths: all frames but the first are left out, so
+    that an epoch holds each episode once. Unequal lengths: dropping one count from all would favour the long episodes
+    by far more than their length, so none are dropped and episodes come up in proportion to their length.
+    """
+    return lengths[0] - 1 if len(set(lengths)) == 1 else 0
+
+
+def _horizon_loss(prediction: Prediction, traces: list[ForesightTrace], mask: Tensor, joint_dim: int) -> Tensor:
+    """Teaches the step scalars at which imagined step the kept future was least uncertain.
+
+    Args:
+        prediction (`Prediction`):
+            Predictions over time, (B, L, ...).
+        traces (`list[ForesightTrace]`):
+            The L foresight traces.
+        mask (`Tensor`):
+            Steps that exist, (B, L).
+        joint_dim (`int`):
+            How many of the D dimensions are joints.
+
+    Returns:
+        `Tensor`: binary cross-entropy between `sigmoid(step)` and the fraction of the horizon, scalar.
+    """
+    fractions = []
+    for trace in traces:
+        rows = torch.arange(trace.chosen.shape[0], device=trace.chosen.device)
+        kept = trace.log_variances[:, trace.chosen, rows]  # (T, B, D)
+        best = uncertainty(kept, joint_dim, "variance").argmin(0) + 1  # (B,)
+        fractions.append(best / kept.shape[0])
+    target = torch.stack(fractions, dim=1)  # (B, L)
+    loss = nn.functional.binary_cross_entropy_with_logits(
+        prediction.step, target[..., None].expand_as(prediction.step), reduction="none"
+    )
+    return loss.mean(-1)[mask].mean()

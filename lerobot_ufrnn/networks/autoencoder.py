@@ -1,0 +1,167 @@
+"""Convolutional autoencoder (CAE): one camera image in, a handful of features out."""
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from .scaling import RangeScaler
+
+
+class ConvAutoencoder(nn.Module):
+    """Compresses one camera's image to `feature_dim` numbers in (-1, 1) and back.
+
+    Stride-2 3x3 convolutions, a hidden linear layer and a tanh bottleneck, mirrored by the decoder (the layout of the
+    public deep-predictive-learning code of the paper's group). Only the difference from a fixed background image goes
+    through the network: a decoder this narrow otherwise spends its first hundreds of updates on drawing the room.
+
+    Args:
+        image_size (`tuple[int, int]`):
+            Height and width in pixels.
+        feature_dim (`int`):
+            Size of the bottleneck.
+        channels (`Sequence[int]`):
+            Output channels of each convolution; each halves height and width.
+        hidden_dim (`int`):
+            Width of the linear layer between convolutions and bottleneck.
+    """
+
+    background: Tensor
+
+    def __init__(self, image_size: tuple[int, int], feature_dim: int, channels: Sequence[int], hidden_dim: int):
+        super().__init__()
+        self.register_buffer("background", torch.zeros(3, *image_size))
+        sizes = [image_size]
+        for _ in channels:
+            height, width = sizes[-1]
+            sizes.append(((height + 1) // 2, (width + 1) // 2))
+        widths = [3, *channels]
+        flat_dim = widths[-1] * sizes[-1][0] * sizes[-1][1]
+
+        encoder: list[nn.Module] = []
+        for inside, outside in pairwise(widths):
+            encoder += [nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.ReLU()]
+        encoder += [nn.Flatten(), nn.Linear(flat_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, feature_dim)]
+        self.encoder = nn.Sequential(*encoder, nn.Tanh())
+
+        self.expander = nn.Sequential(
+            nn.Linear(feature_dim, hidden_dim),
+            nn.ReLU(),
+            nn.Linear(hidden_dim, flat_dim),
+            nn.ReLU(),
+            nn.Unflatten(1, (widths[-1], *sizes[-1])),
+        )
+        decoder: list[nn.Module] = []
+        for level in range(len(channels), 0, -1):
+            # An odd side was rounded up on the way down; output_padding restores exactly the size it had.
+            (height, width), (full_height, full_width) = sizes[level], sizes[level - 1]
+            padding = (full_height - (2 * height - 1), full_width - (2 * width - 1))
+            decoder.append(
+                nn.ConvTranspose2d(widths[level], widths[level - 1], 3, stride=2, padding=1, output_padding=padding)
+            )
+            if level > 1:
+                decoder.append(nn.ReLU())
+        self.decoder = nn.Sequential(*decoder)
+        self.apply(_keep_variance)
+        for parameter in decoder[-1].parameters():  # so that the first reconstruction is the background itself
+            nn.init.zeros_(parameter)
+
+    @torch.no_grad()
+    def fit_background(self, images: Tensor) -> None:
+        """Takes the mean of `images` (M, 3, height, width) in [0, 1] as the background."""
+        self.background.copy_(images.mean(dim=0))
+
+    def encode(self, images: Tensor) -> Tensor:
+        """Features (B, feature_dim) of `images` (B, 3, height, width) in [0, 1]."""
+        # Channels-last images make the convolutions about twice as fast on a CPU.
+        return self.encoder((images - self.background).contiguous(memory_format=torch.channels_last))
+
+    def decode(self, features: Tensor) -> Tensor:
+        """Images (B, 3, height, width), about in [0, 1], of `features` (B, feature_dim)."""
+        return self.decoder(self.expander(features).contiguous(memory_format=torch.channels_last)) + self.background
+
+
+def _keep_variance(layer: nn.Module) -> None:
+    """Initialises a layer so that the signal keeps its size (He et al. 2015) over the ten layers of an autoencoder."""
+    if isinstance(layer, nn.Conv2d | nn.Linear):
+        nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    elif isinstance(layer, nn.ConvTranspose2d):
+        # A stride of two leaves each output pixel 9 / 4 of the nine weights.
+        nn.init.normal_(layer.weight, std=math.sqrt(2 / (layer.in_channels * 9 / 4)))
+    if isinstance(layer, nn.Conv2d | nn.Linear | nn.ConvTranspose2d) and layer.bias is not None:
+        nn.init.zeros_(layer.bias)
+
+
+class ImageEncoder(nn.Module):
+    """The autoencoders of all cameras and the scaling of their features into the recurrent network's range.
+
+    Args:
+        cameras (`Sequence[str]`):
+            Camera keys, e.g. `observation.images.front`; their order is the order of the features.
+        image_size (`tuple[int, int]`):
+            Height and width in pixels that every image is resized to.
+        feature_dim (`int`):
+            Features per camera.
+        channels (`Sequence[int]`):
+            See [`ConvAutoencoder`].
+        hidden_dim (`int`):
+            See [`ConvAutoencoder`].
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[str],
+        image_size: tuple[int, int],
+        feature_dim: int,
+        channels: Sequence[int],
+        hidden_dim: int,
+    ):
+        super().__init__()
+        self.cameras = tuple(cameras)
+        self.image_size = tuple(image_size)
+        self.feature_dim = feature_dim
+        self.autoencoders = nn.ModuleList(
+            ConvAutoencoder(image_size, feature_dim, channels, hidden_dim) for _ in self.cameras
+        )
+        self.scaler = RangeScaler(feature_dim * len(self.cameras))
+
+    def by_camera(self) -> Iterator[tuple[str, ConvAutoencoder]]:
+        """Camera keys with their autoencoders, in the order of the features."""
+        for camera, autoencoder in zip(self.cameras, self.autoencoders, strict=True):
+            assert isinstance(autoencoder, ConvAutoencoder)
+            yield camera, autoencoder
+
+    def resize(self, images: Tensor) -> Tensor:
+        """Float images (B, 3, height, width) in [0, 1], resized to `image_size`; uint8 images are divided by 255."""
+        if images.dtype == torch.uint8:
+            images = images.to(torch.get_default_dtype()) / 255
+        if tuple(images.shape[-2:]) != self.image_size:
+            images = nn.functional.interpolate(images, self.image_size, mode="bilinear", antialias=True)
+        return images
+
+    def encode(self, images: dict[str, Tensor]) -> Tensor:
+        """Unscaled features of all cameras.
+
+        Args:
+            images (`dict[str, Tensor]`):
+                Camera key to images (B, 3, height, width), uint8 or float in [0, 1].
+
+        Returns:
+            `Tensor`: features (B, feature_dim x cameras) in (-1, 1).
+        """
+        encoded = [autoencoder.encode(self.resize(images[camera])) for camera, autoencoder in self.by_camera()]
+        return torch.cat(encoded, dim=-1)
+
+    def forward(self, images: dict[str, Tensor]) -> Tensor:
+        """Scaled features (B, feature_dim x cameras) of all cameras: the image half of the network's input."""
+        return self.scaler.scale(self.encode(images))
+
+    def decode(self, scaled_features: Tensor) -> dict[str, Tensor]:
+        """Images (B, 3, height, width) in [0, 1] of each camera, from scaled features (B, feature_dim x cameras)."""
+        features = self.scaler.unscale(scaled_features).split(self.feature_dim, dim=-1)
+        return {
+            camera: autoencoder.decode(part)
+            for (camera, autoencoder), part in zip(self.by_camera(), features, strict=True)
+        }

@@ -1,0 +1,147 @@
+"""Stochastic hierarchical LSTM (SH-LSTM): UF-RNN Fig. 2(B).
+
+Two lower LSTMs, one for the joints and one for the image features, carry the fast dynamics of their modality; a small
+upper LSTM reads both and speaks back to both. Each lower LSTM predicts mean and variance of its modality's next value.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from .gaussian import bound_log_variance
+
+
+class HiddenState(NamedTuple):
+    """Hidden (`h`) and cell (`c`) states of the three LSTMs, each of shape (B, hidden size)."""
+
+    h_joint: Tensor
+    c_joint: Tensor
+    h_image: Tensor
+    c_image: Tensor
+    h_shared: Tensor
+    c_shared: Tensor
+
+
+class Prediction(NamedTuple):
+    """What a hidden state predicts of the next sensor values; D = joint_dim + feature_dim, joints first.
+
+    Attributes:
+        mean (`Tensor`): scaled next joints and image features, (B, D), in (-1, 1).
+        log_variance (`Tensor`): log-variance of each, (B, D).
+        step (`Tensor`): one scalar a modality for a learned foresight horizon, (B, 2), unbounded.
+    """
+
+    mean: Tensor
+    log_variance: Tensor
+    step: Tensor
+
+
+class SHLSTM(nn.Module):
+    """Stochastic hierarchical LSTM.
+
+    Args:
+        joint_dim (`int`):
+            Number of joints D_j, gripper included.
+        feature_dim (`int`):
+            Number of image features D_f, of all cameras together.
+        joint_hidden_dim (`int`):
+            Hidden size of `LSTM_joint`.
+        image_hidden_dim (`int`):
+            Hidden size of `LSTM_image`.
+        shared_hidden_dim (`int`):
+            Hidden size of `LSTM_shared`.
+        log_variance_range (`tuple[float, float]`):
+            Bounds of every predicted log-variance.
+    """
+
+    def __init__(
+        self,
+        joint_dim: int,
+        feature_dim: int,
+        joint_hidden_dim: int,
+        image_hidden_dim: int,
+        shared_hidden_dim: int,
+        log_variance_range: tuple[float, float],
+    ):
+        super().__init__()
+        self.joint_dim = joint_dim
+        self.feature_dim = feature_dim
+        self.log_variance_range = log_variance_range
+        lower_hidden_dim = joint_hidden_dim + image_hidden_dim
+        self.joint_cell = nn.LSTMCell(joint_dim, joint_hidden_dim)
+        self.image_cell = nn.LSTMCell(feature_dim, image_hidden_dim)
+        self.shared_cell = nn.LSTMCell(lower_hidden_dim, shared_hidden_dim)
+        self.shared_to_lower = nn.Linear(shared_hidden_dim, lower_hidden_dim)
+        self.joint_head = nn.Linear(joint_hidden_dim, 2 * joint_dim + 1)
+        self.image_head = nn.Linear(image_hidden_dim, 2 * feature_dim + 1)
+
+    def initial_state(self, batch_size: int) -> HiddenState:
+        """Zero state, the same for every sequence: a learned state per sequence would leak what is to be found out.
+
+        Args:
+            batch_size (`int`):
+                Number of sequences B.
+
+        Returns:
+            `HiddenState`: zeros, (B, hidden size) each.
+        """
+        weight = self.joint_head.weight
+        joint, image, shared = (
+            weight.new_zeros(batch_size, cell.hidden_size)
+            for cell in (self.joint_cell, self.image_cell, self.shared_cell)
+        )
+        return HiddenState(joint, joint, image, image, shared, shared)
+
+    def step(self, inputs: Tensor, state: HiddenState) -> HiddenState:
+        """Advances the hidden state by one time step.
+
+        The upper cell reads both lower `h`; its own `h`, mapped back, replaces them, while their cell states are kept;
+        then the lower cells read the inputs.
+
+        Args:
+            inputs (`Tensor`):
+                Scaled joints and image features of this step, (B, D).
+            state (`HiddenState`):
+                State after the previous step.
+
+        Returns:
+            `HiddenState`: state after this step.
+        """
+        lower_h = torch.cat((state.h_joint, state.h_image), dim=-1)
+        h_shared, c_shared = self.shared_cell(lower_h, (state.h_shared, state.c_shared))
+        h_joint, h_image = self.shared_to_lower(h_shared).split(
+            (self.joint_cell.hidden_size, self.image_cell.hidden_size), dim=-1
+        )
+        joints, features = inputs.split((self.joint_dim, self.feature_dim), dim=-1)
+        h_joint, c_joint = self.joint_cell(joints, (h_joint, state.c_joint))
+        h_image, c_image = self.image_cell(features, (h_image, state.c_image))
+        return HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)
+
+    def predict(self, state: HiddenState) -> Prediction:
+        """Reads the prediction of the next sensor values off a hidden state.
+
+        Args:
+            state (`HiddenState`):
+                Any hidden state, (B, hidden size) each.
+
+        Returns:
+            `Prediction`: means, log-variances and step scalars.
+        """
+        joint = self.joint_head(state.h_joint)
+        image = self.image_head(state.h_image)
+        j, f = self.joint_dim, self.feature_dim
+        mean = torch.tanh(torch.cat((joint[..., :j], image[..., :f]), dim=-1))
+        raw_log_variance = torch.cat((joint[..., j : 2 * j], image[..., f : 2 * f]), dim=-1)
+        step = torch.cat((joint[..., 2 * j :], image[..., 2 * f :]), dim=-1)
+        return Prediction(mean, bound_log_variance(raw_log_variance, *self.log_variance_range), step)
+
+    def predict_mean(self, state: HiddenState) -> Tensor:
+        """Only the means of `predict`, (B, D): all that a closed loop feeds back."""
+        joint = nn.functional.linear(
+            state.h_joint, self.joint_head.weight[: self.joint_dim], self.joint_head.bias[: self.joint_dim]
+        )
+        image = nn.functional.linear(
+            state.h_image, self.image_head.weight[: self.feature_dim], self.image_head.bias[: self.feature_dim]
+        )
+        return torch.tanh(torch.cat((joint, image), dim=-1))

@@ -1,0 +1,163 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType
+from lerobot.envs.factory import make_env, make_env_config
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+from lerobot.scripts.lerobot_eval import rollout
+
+from env_door.configuration_door import DoorEnvConfig
+from env_door.env import DoorEnv
+from env_door.expert import DoorExpert
+from env_door.trials import read_trials
+
+
+class ExpertPolicy(torch.nn.Module):
+    """Moves the first environments by the expert and lets the others stand."""
+
+    def __init__(self, envs, directions):
+        super().__init__()
+        self.envs = envs
+        self.directions = directions
+
+    def reset(self):
+        self.experts = None
+
+    def select_action(self, observation):
+        if self.experts is None:
+            self.experts = [
+                DoorExpert(env.unwrapped, directions)
+                for env, directions in zip(self.envs, self.directions, strict=False)
+            ]
+            for expert in self.experts:
+                expert.reset(np.random.default_rng(0))
+        actions = observation["observation.state"].clone()
+        for index, expert in enumerate(self.experts):
+            actions[index] = torch.from_numpy(expert.act())
+        return actions
+
+
+def run(vector_env, directions, seeds):
+    def unchanged(batch):
+        return batch
+
+    policy = ExpertPolicy(vector_env.envs, directions)
+    return rollout(vector_env, policy, unchanged, unchanged, unchanged, unchanged, seeds=seeds)
+
+
+def test_type_is_registered():
+    config = make_env_config("door", task="pull", door_offset=0.03)
+    assert isinstance(config, DoorEnvConfig)
+    assert (config.type, config.task, config.door_offset, config.fps) == ("door", "pull", 0.03, 10)
+
+
+@pytest.mark.parametrize(("arm", "dimension"), [("ur5e", 7), ("panda", 8)])
+def test_policy_features(arm, dimension):
+    features = env_to_policy_features(DoorEnvConfig(arm=arm))
+    assert {key: (feature.type, feature.shape) for key, feature in features.items()} == {
+        "action": (FeatureType.ACTION, (dimension,)),
+        "observation.state": (FeatureType.STATE, (dimension,)),
+        "observation.images.front": (FeatureType.VISUAL, (3, 128, 128)),
+    }
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "allowed"),
+    [
+        ("task", "open", "push, pull, slide, random, all"),
+        ("task", None, "push, pull, slide, random, all"),
+        ("fps", 30, "must be 10"),
+        ("episode_length", 0, "at least 1"),
+        ("arm", "ur10", "ur5e, panda"),
+        ("door_offset", 0.06, "0 to 0.05"),
+        ("door_offset", -0.01, "0 to 0.05"),
+        ("door_offset", float("nan"), "0 to 0.05"),
+        ("start_variation", 0.06, "0 to 0.05"),
+        ("command_limit", 0.0, "0.01 to 1.0"),
+        ("command_limit", 1.1, "0.01 to 1.0"),
+    ],
+)
+def test_bad_fields_are_refused(field, value, allowed):
+    with pytest.raises(ValueError, match=f"--env.{field}.*{allowed}"):
+        DoorEnvConfig(**{field: value})
+
+
+@pytest.mark.parametrize(
+    "field_value", [("door_offset", 0.05), ("start_variation", 0.05), ("command_limit", 1.0), ("command_limit", 0.01)]
+)
+def test_the_environment_takes_the_extremes_that_the_configuration_allows(field_value):
+    field, value = field_value
+    DoorEnvConfig(**{field: value})
+    DoorEnv(**{field: value})
+
+
+def test_all_makes_one_suite_a_kind():
+    suites = make_env(DoorEnvConfig(task="all"), n_envs=1)
+    kinds = {name: tasks[0].reset(seed=0)[1]["door_kind"][0] for name, tasks in suites.items()}
+    assert kinds == {"door_push": "push", "door_pull": "pull", "door_slide": "slide"}
+    for tasks in suites.values():
+        tasks[0].close()
+
+
+def test_random_draws_kinds_by_the_seed():
+    (tasks,) = make_env(DoorEnvConfig(task="random"), n_envs=1).values()
+    kinds = {tasks[0].reset(seed=seed, options={"lerobot_new_rollout": True})[1]["door_kind"][0] for seed in range(12)}
+    assert kinds == {"push", "pull", "slide"}
+    tasks[0].close()
+
+
+def test_observations_and_time_limit():
+    (tasks,) = make_env(DoorEnvConfig(task="push", episode_length=3), n_envs=2).values()
+    env = tasks[0]
+    observation, _ = env.reset(seed=[1, 2])
+    batch = preprocess_observation(observation)
+    assert batch["observation.images.front"].shape == (2, 3, 128, 128)
+    assert batch["observation.state"].shape == (2, 7)
+    assert env.call("task_description") == ("open the door",) * 2
+    assert env.call("_max_episode_steps") == (3, 3)
+    truncations = [env.step(observation["agent_pos"])[3].tolist() for _ in range(3)]
+    assert truncations == [[False] * 2, [False] * 2, [True] * 2]
+    env.close()
+
+
+def test_rollout_of_lerobot_eval_sees_success_and_failure(tmp_path):
+    log = tmp_path / "trials.jsonl"
+    config = DoorEnvConfig(task="pull", episode_length=130, trial_log=str(log))
+    (tasks,) = make_env(config, n_envs=3).values()
+    env = tasks[0]
+    assert isinstance(env, gym.vector.SyncVectorEnv)
+    # Straight away, after a wrong try, and not at all: only the last one runs into the time limit.
+    for _ in range(2):  # a second roll-out must thaw the environments frozen by the first
+        result = run(env, [("pull",), ("push", "pull")], seeds=[7, 8, 9])
+        assert result["success"].any(dim=1).tolist() == [True, True, False]
+        assert result["done"].all(dim=1).tolist() == [False] * 3
+        assert result["reward"].sum(dim=1).tolist() == [1.0, 1.0, 0.0]
+        assert result["action"].shape == (3, 130, 7)
+    env.close()
+    trials = sorted(read_trials(log), key=lambda trial: trial.seed)
+    assert [trial.seed for trial in trials] == [7, 7, 8, 8, 9, 9]
+    assert [(trial.first_try, trial.recovered, trial.success) for trial in trials[::2]] == [
+        (True, False, True),
+        (False, True, True),
+        (False, False, False),
+    ]
+    assert trials[::2] == trials[1::2]
+    assert trials[0].steps < trials[2].steps < trials[4].steps == 130
+    assert trials[2].attempts == ("push", "pull")
+    assert {trial.door_kind for trial in trials} == {"pull"}
+    # The steps of the log are those at which the roll-out was done.
+    assert [int(done.int().argmax()) + 1 for done in result["done"]] == [trial.steps for trial in trials[::2]]
+
+
+@pytest.mark.slow
+def test_asynchronous_environments_run_in_processes(tmp_path):
+    log = tmp_path / "trials.jsonl"
+    config = DoorEnvConfig(task="slide", episode_length=2, trial_log=str(log))
+    (tasks,) = make_env(config, n_envs=2, use_async_envs=True).values()
+    env = tasks[0]
+    observation, _ = env.reset(seed=[1, 2], options={"lerobot_new_rollout": True})
+    for _ in range(4):
+        observation = env.step(observation["agent_pos"])[0]
+    env.close()
+    assert sorted(trial.seed for trial in read_trials(log)) == [1, 2]

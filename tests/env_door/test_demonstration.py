@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+
+from env_door import demonstration
+from env_door.demonstration import demonstrate
+from env_door.env import DoorEnv
+from env_door.kinematics import UnreachableError
+from env_door.latch import KINDS
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = DoorEnv(door_offset=0.05)
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_nothing_before_the_branch_tells_the_kind(env, seed):
+    first, *others = [demonstrate(env, kind, seed, 110) for kind in KINDS]
+    branch = first.branch_step
+    for other in others:
+        assert other.branch_step == branch
+        np.testing.assert_array_equal(other.actions[:branch], first.actions[:branch])
+        # What is seen at the branch was caused by the steps before it.
+        np.testing.assert_array_equal(other.states[: branch + 1], first.states[: branch + 1])
+        np.testing.assert_array_equal(other.images[: branch + 1], first.images[: branch + 1])
+        assert not np.array_equal(other.actions[branch + 10], first.actions[branch + 10])
+
+
+def test_frames_hold_what_was_seen_and_what_was_done_then(env):
+    run = demonstrate(env, "pull", 3, 100)
+    observation, _ = env.reset(seed=3, options={"kind": "pull"})
+    for step in range(run.success_step + 1):
+        np.testing.assert_array_equal(run.states[step], observation["agent_pos"])
+        np.testing.assert_array_equal(run.images[step], observation["pixels"]["front"])
+        observation, _, terminated, _, _ = env.step(run.actions[step])
+        assert terminated == (step == run.success_step)
+
+
+def test_seeds_differ_in_start_and_timing(env):
+    runs = [demonstrate(env, "push", seed, 100) for seed in range(3)]
+    assert len({run.states[0].tobytes() for run in runs}) == 3
+    assert len({run.branch_step for run in runs}) > 1
+
+
+def test_too_few_steps_for_the_branch_are_refused(env):
+    branch = demonstrate(env, "slide", 0, 110).branch_step
+    with pytest.raises(ValueError, match=f"num_steps={branch} ends before the door is tried, at step {branch}"):
+        demonstrate(env, "slide", 0, branch)
+
+
+def test_failure_to_open_in_time_gives_nothing(env):
+    branch = demonstrate(env, "slide", 0, 110).branch_step
+    assert demonstrate(env, "slide", 0, branch + 5) is None
+
+
+def test_door_out_of_reach_gives_nothing(env, monkeypatch):
+    class LostExpert:
+        def __init__(self, env, directions):
+            pass
+
+        def reset(self, rng):
+            raise UnreachableError("too far")
+
+    monkeypatch.setattr(demonstration, "DoorExpert", LostExpert)
+    assert demonstrate(env, "push", 0, 110) is None

@@ -1,0 +1,250 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import env_door
+from env_door.env import DoorEnv
+from env_door.expert import DoorExpert
+from env_door.latch import OPENINGS
+
+
+def play(env, kind, seed, actions=None, directions=("push",), num_steps=None):
+    """Positions, observations and infos of one episode, either of given actions or of the expert's."""
+    observation, info = env.reset(seed=seed, options={"kind": kind})
+    if actions is None:
+        expert = DoorExpert(env, directions)
+        expert.reset(np.random.default_rng(seed))
+        actions = [expert.act() for _ in range(num_steps or expert.branch_step)]
+    trace = [(env.data.qpos.copy(), observation, info)]
+    for action in actions:
+        observation, _, _, _, info = env.step(action)
+        trace.append((env.data.qpos.copy(), observation, info))
+    return trace
+
+
+def assert_identical(first, second):
+    for (position, observation, info), (other_position, other_observation, other_info) in zip(
+        first, second, strict=True
+    ):
+        np.testing.assert_array_equal(position, other_position)
+        np.testing.assert_array_equal(observation["agent_pos"], other_observation["agent_pos"])
+        np.testing.assert_array_equal(observation["pixels"]["front"], other_observation["pixels"]["front"])
+        assert info["opening"] == other_info["opening"]
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = DoorEnv(door_offset=0.05)
+    yield env
+    env.close()
+
+
+def test_registered_with_time_limit():
+    env = gym.make("env_door/Door-v0", kind="push")
+    assert env.spec.max_episode_steps == 300
+    assert env.metadata["render_fps"] == 10
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("arm", ["ur5e", "panda"])
+def test_gymnasium_checker_finds_nothing(arm):
+    check_env(gym.make("env_door/Door-v0", arm=arm).unwrapped)
+
+
+@pytest.mark.parametrize(("arm", "size"), [("ur5e", 7), ("panda", 8)])
+def test_spaces_fit_observations(arm, size):
+    env = DoorEnv(arm=arm)
+    observation, _ = env.reset(seed=3)
+    assert observation in env.observation_space
+    assert observation["agent_pos"].shape == env.action_space.shape == (size,)
+    assert len(env.joint_names) == size
+    assert env.joint_names[-1] == "gripper"
+    env.close()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_kinds_are_bit_identical_until_tried(env, seed):
+    """The same seed and actions must give the same bits for every kind, through approach, grasp and twist."""
+    traces = [play(env, kind, seed) for kind in env_door.KINDS]
+    assert env.latch.unlatched, "the trace must go through the twist, or it proves little"
+    for other in traces[1:]:
+        assert_identical(traces[0], other)
+
+
+@pytest.mark.parametrize("direction", env_door.KINDS)
+def test_the_other_two_kinds_stay_identical_during_a_wrong_try(env, direction):
+    """A door that does not open in a direction tells nothing about which other direction it opens in."""
+    expert_steps = 75
+    others = [kind for kind in env_door.KINDS if kind != direction]
+    first, second = (play(env, kind, 5, directions=(direction,), num_steps=expert_steps) for kind in others)
+    assert first[-1][2]["attempts"] == (direction,)
+    assert_identical(first, second)
+
+
+def test_kinds_part_once_tried(env):
+    push, pull = (play(env, kind, 0, directions=("push",), num_steps=85) for kind in ("push", "pull"))
+    assert push[-1][2]["opening"] > 0.5
+    assert pull[-1][2]["opening"] < 0.02
+    difference = push[-1][1]["pixels"]["front"].astype(int) - pull[-1][1]["pixels"]["front"]
+    assert (np.abs(difference).max(axis=-1) > 30).mean() > 0.02, "an opening door must be visible in the picture"
+
+
+def test_episodes_leave_nothing_behind():
+    """An episode after others, with the door freed and held, equals the same episode in a fresh environment."""
+    used, fresh = DoorEnv(), DoorEnv()
+    play(used, "pull", 1, directions=("pull",), num_steps=80)
+    used.hold_door(5.0)
+    play(used, "slide", 2, directions=("slide",), num_steps=70)
+    assert_identical(play(used, "push", 7, num_steps=75), play(fresh, "push", 7, num_steps=75))
+    used.close()
+    fresh.close()
+
+
+def test_seed_gives_same_start_for_every_kind_and_way_of_choosing_it(env):
+    starts = []
+    for options in ({"kind": "push"}, {"kind": "slide"}, {}, {"kind": "random"}):
+        observation, _ = env.reset(seed=11, options=options)
+        starts.append((observation["agent_pos"], env.current_offset))
+    for joints, offset in starts[1:]:
+        np.testing.assert_array_equal(joints, starts[0][0])
+        assert offset == starts[0][1]
+    observation, _ = env.reset(seed=11, options={"door_offset": -0.03})
+    np.testing.assert_array_equal(observation["agent_pos"], starts[0][0])
+    assert env.data.site("knob").xpos[1] == pytest.approx(-0.03)
+
+
+def test_random_kind_draws_all_kinds(env):
+    kinds = {env.reset(seed=seed)[1]["door_kind"] for seed in range(12)}
+    assert kinds == set(env_door.KINDS)
+
+
+def test_start_and_offset_stay_in_their_ranges():
+    env = DoorEnv(door_offset=0.03, start_variation=0.02)
+    starts, offsets = [], []
+    for seed in range(40):
+        env.reset(seed=seed)
+        starts.append(env.data.site("tool").xpos - [0.66 - 0.16, 0.0, 0.95])
+        offsets.append(env.current_offset)
+    assert np.abs(starts).max() <= 0.02 + 1e-4
+    assert np.abs(starts).max() > 0.015
+    assert 0.02 < np.abs(offsets).max() <= 0.03
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "action", [np.zeros(6), np.zeros((1, 7)), np.full(7, np.nan), np.array([0, 0, 0, np.inf, 0, 0, 0])]
+)
+def test_bad_actions_are_refused(env, action):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"kind": "lift"}, "kind='lift'"),
+        ({"arm": "ur3"}, "arm='ur3'"),
+        ({"door_offset": 0.06}, "door_offset=0.06"),
+        ({"door_offset": float("nan")}, "door_offset=nan"),
+        ({"command_limit": 0.0}, "command_limit=0.0"),
+        ({"render_mode": "human"}, "render_mode='human'"),
+        ({"observation_size": 4}, "observation_size=4"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DoorEnv(**arguments)
+
+
+@pytest.mark.parametrize("options", [{"kind": "lift"}, {"door_offset": 0.06}, {"colour": "red"}])
+def test_bad_reset_options_are_refused(env, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        env.reset(seed=0, options=options)
+
+
+def test_targets_are_limited_as_on_a_real_controller(env):
+    env.reset(seed=0)
+    measured = env.measured_joints()
+    target = env.limit_action(measured + np.array([1.0, -1.0, 0.01, 0, 0, 0, 1.0]))
+    expected = measured + np.array([0.08, -0.08, 0.01, 0, 0, 0, 0.176])
+    np.testing.assert_allclose(target, expected, atol=1e-9)
+
+
+def test_joint_speed_limits_when_the_command_limit_does_not():
+    env = DoorEnv(command_limit=1.0)
+    env.reset(seed=0)
+    measured = env.measured_joints()
+    change = env.limit_action(measured + np.array([0.9, 0, 0, 0, 0, 0, 0])) - measured
+    assert change[0] == pytest.approx(np.pi * 0.1, abs=1e-4)
+    env.close()
+
+
+def test_free_arm_follows_its_target(env):
+    env.reset(seed=0)
+    target = env.measured_joints()
+    for _ in range(10):
+        target[:6] += 0.02
+        observation, *_ = env.step(target.astype(np.float32))
+    np.testing.assert_allclose(observation["agent_pos"][:6], target[:6], atol=0.005)
+
+
+def test_success_ends_the_episode_but_not_the_simulation(env):
+    env.reset(seed=0, options={"kind": "slide"})
+    expert = DoorExpert(env, ("slide",))
+    expert.reset(np.random.default_rng(0))
+    rewards, successes = [], []
+    for _ in range(125):
+        _, reward, terminated, truncated, info = env.step(expert.act())
+        assert not truncated
+        assert terminated == info["is_success"] == (reward == 1.0)
+        rewards.append(reward)
+        successes.append(terminated)
+    assert 85 <= successes.index(True) <= 110
+    assert all(successes[-5:])
+    assert info["opening"] == pytest.approx(0.19 / OPENINGS["slide"].threshold, abs=0.05)
+
+
+def test_held_door_stops_and_then_opens(env):
+    env.reset(seed=0, options={"kind": "push"})
+    expert = DoorExpert(env, ("push",))
+    expert.reset(np.random.default_rng(0))
+    info = {"opening": 0.0}
+    while info["opening"] < 0.2:
+        *_, info = env.step(expert.act())
+    env.hold_door(1.0)
+    held = []
+    action = expert.act()
+    for _ in range(10):
+        *_, info = env.step(action)
+        held.append(info["opening"])
+    assert np.ptp(held) < 0.02
+    for _ in range(60):
+        *_, info = env.step(expert.act())
+    assert info["is_success"]
+
+
+@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
+def test_bad_hold_is_refused(env, seconds):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="seconds"):
+        env.hold_door(seconds)
+
+
+def test_diverged_physics_is_told():
+    env = DoorEnv()
+    env.reset(seed=0)
+    env.data.qvel[:] = 1e12
+    with pytest.raises(RuntimeError, match="diverged"):
+        env.step(env.measured_joints().astype(np.float32))
+    env.reset(seed=0)
+    env.step(env.measured_joints().astype(np.float32))
+    env.close()
+
+
+def test_task_does_not_tell_the_kind():
+    descriptions = {DoorEnv(kind=kind).task_description for kind in env_door.KINDS}
+    assert descriptions == {"open the door"}

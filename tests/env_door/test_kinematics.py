@@ -1,0 +1,117 @@
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from env_door.env import GRASP_ROTATION
+from env_door.kinematics import InverseKinematics, UnreachableError, rotation_about, rotation_vector
+from env_door.scene import ARMS, PANDA, UR5E, load_model
+
+SOLVERS = {arm.name: InverseKinematics(load_model(arm.name), arm.joints) for arm in ARMS.values()}
+
+
+def ur5e_forward(joints):
+    """Tool pose from Universal Robots' published Denavit-Hartenberg table, without MuJoCo."""
+    table = zip(
+        joints,
+        (0.1625, 0, 0, 0.1333, 0.0997, 0.0996 + 0.15),
+        (0, -0.425, -0.3922, 0, 0, 0),
+        (np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0),
+        strict=True,
+    )
+    pose = np.eye(4)
+    pose[:3, 3] = [0, -0.06, 0.5]
+    for theta, d, a, alpha in table:
+        link = np.eye(4)
+        link[:3, :3] = Rotation.from_euler("Z", theta).as_matrix() @ Rotation.from_euler("X", alpha).as_matrix()
+        link[:3, 3] = [a * np.cos(theta), a * np.sin(theta), d]
+        pose = pose @ link
+    return pose
+
+
+def panda_forward(joints):
+    """Tool pose from Franka's published (modified) Denavit-Hartenberg table, without MuJoCo."""
+    table = zip(
+        (*joints, 0.0),
+        (0.333, 0, 0.316, 0, 0.384, 0, 0, 0.107 + 0.15),
+        (0, 0, 0, 0.0825, -0.0825, 0, 0.088, 0),
+        (0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi / 2, 0),
+        strict=True,
+    )
+    pose = np.eye(4)
+    pose[:3, 3] = [0.11, -0.05, 0.1]
+    for theta, d, a, alpha in table:
+        tilt, link = np.eye(4), np.eye(4)
+        tilt[:3, :3] = Rotation.from_euler("X", alpha).as_matrix()
+        tilt[:3, 3] = [a, 0, 0]
+        link[:3, :3] = Rotation.from_euler("Z", theta).as_matrix()
+        link[:3, 3] = [0, 0, d]
+        pose = pose @ tilt @ link
+    return pose
+
+
+@pytest.mark.parametrize(("arm", "oracle"), [(UR5E, ur5e_forward), (PANDA, panda_forward)])
+def test_forward_kinematics_is_the_published_one(arm, oracle):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        joints = rng.uniform(-1.5, 1.5, len(arm.joints))
+        position, rotation = SOLVERS[arm.name].forward(joints)
+        expected = oracle(joints)
+        np.testing.assert_allclose(position, expected[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(rotation, expected[:3, :3], atol=1e-6)
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=lambda arm: arm.name)
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(shift=st.tuples(*[st.floats(-0.06, 0.06)] * 3), twist=st.floats(0.0, 0.95))
+def test_solution_reaches_the_pose_within_limits(arm, shift, twist):
+    solver = SOLVERS[arm.name]
+    position = np.array([0.60, 0.0, 0.95]) + shift
+    rotation = Rotation.from_euler("X", twist).as_matrix() @ GRASP_ROTATION
+    joints = solver.solve(position, rotation, np.array(arm.ready_pose))
+    reached, orientation = solver.forward(joints)
+    np.testing.assert_allclose(reached, position, atol=2e-5)
+    np.testing.assert_allclose(orientation, rotation, atol=2e-4)
+    model = load_model(arm.name)
+    ranges = np.array([model.joint(name).range for name in arm.joints])
+    assert (joints >= ranges[:, 0]).all()
+    assert (joints <= ranges[:, 1]).all()
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=lambda arm: arm.name)
+def test_out_of_reach_is_told(arm):
+    with pytest.raises(UnreachableError, match="cannot reach"):
+        SOLVERS[arm.name].solve(np.array([3.0, 0.0, 1.0]), GRASP_ROTATION, np.array(arm.ready_pose))
+
+
+def test_joint_limits_make_a_pose_unreachable():
+    model = load_model("ur5e")
+    free = InverseKinematics(model, UR5E.joints).solve(
+        np.array([0.6, 0, 0.95]), GRASP_ROTATION, np.array(UR5E.ready_pose)
+    )
+    elbow = model.joint("elbow")
+    elbow.range = [free[2] + 0.1, 3.1]
+    with pytest.raises(UnreachableError):
+        InverseKinematics(model, UR5E.joints).solve(np.array([0.6, 0, 0.95]), GRASP_ROTATION, np.array(UR5E.ready_pose))
+
+
+def test_solver_does_not_disturb_the_simulation():
+    model = load_model("ur5e")
+    data = mujoco.MjData(model)
+    before = data.qpos.copy()
+    InverseKinematics(model, UR5E.joints).solve(np.array([0.6, 0, 0.95]), GRASP_ROTATION, np.array(UR5E.ready_pose))
+    np.testing.assert_array_equal(data.qpos, before)
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(st.tuples(*[st.floats(-1.7, 1.7)] * 3))
+def test_rotation_vector_is_scipys(vector):
+    matrix = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(rotation_vector(matrix), vector, atol=1e-7)
+
+
+def test_rotation_about_is_scipys():
+    axis = np.array([1.0, 2.0, -2.0]) / 3
+    np.testing.assert_allclose(rotation_about(axis, 0.7), Rotation.from_rotvec(0.7 * axis).as_matrix(), atol=1e-12)

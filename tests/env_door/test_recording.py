@@ -1,0 +1,167 @@
+"""What a recording holds, and what it must not tell."""
+
+import json
+
+import numpy as np
+import pytest
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import decode_video_frames, encode_video_frames
+from PIL import Image
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from env_door.demonstration import demonstrate
+from env_door.env import DoorEnv
+from env_door.recording_config import FrameEncoderConfig
+
+CAMERA = "observation.images.front"
+JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper"]
+
+
+@pytest.fixture(scope="module")
+def dataset(recording):
+    config, _ = recording
+    return LeRobotDataset(config.repo_id, root=config.root, video_backend="pyav", return_uint8=True)
+
+
+@pytest.fixture(scope="module")
+def episodes(dataset, recording):
+    """Decoded images `(E, T, H, W, 3)`, states `(E, T, D)` and actions `(E, T, D)`."""
+    config, _ = recording
+    shape = (config.total_episodes, config.num_steps)
+    table = dataset.hf_dataset.with_format("numpy")
+    images = []
+    for episode in range(config.total_episodes):
+        first = dataset.meta.episodes[episode][f"videos/{CAMERA}/from_timestamp"]
+        times = [first + step / 10 for step in range(config.num_steps)]
+        path = dataset.root / dataset.meta.get_video_file_path(episode, CAMERA)
+        images.append(decode_video_frames(path, times, 1e-4, "pyav", return_uint8=True).permute(0, 2, 3, 1).numpy())
+    return (
+        np.stack(images),
+        np.stack(table["observation.state"]).reshape(*shape, -1),
+        np.stack(table["action"]).reshape(*shape, -1),
+    )
+
+
+def test_features_are_those_of_the_real_robot(dataset):
+    names = [f"{joint}.pos" for joint in JOINTS]
+    for key in ("observation.state", "action"):
+        assert dataset.features[key]["names"] == names
+        assert dataset.features[key]["shape"] == (7,)
+    assert dataset.features[CAMERA]["shape"] == (128, 128, 3)
+    assert dataset.features[CAMERA]["names"] == ["height", "width", "channels"]
+    assert (dataset.fps, dataset.meta.robot_type) == (10, "ur5e_robotiq")
+    assert list(dataset.meta.tasks.index) == ["open the door"]
+
+
+def test_report_describes_the_dataset(dataset, recording):
+    config, report = recording
+    assert dataset.num_episodes == report.total_episodes == len(report.episodes) == 9
+    assert dataset.num_frames == 9 * config.num_steps
+    assert [episode["kind"] for episode in report.episodes] == ["push", "pull", "slide"] * 3
+    assert [episode["episode_index"] for episode in report.episodes] == list(range(9))
+    assert all(episode["branch_step"] < episode["success_step"] < config.num_steps for episode in report.episodes)
+
+
+def test_dataset_holds_what_the_expert_did(dataset, recording, episodes):
+    config, report = recording
+    env = DoorEnv()
+    images, states, actions = episodes
+    for index in (0, 4, 8):
+        episode = report.episodes[index]
+        run = demonstrate(env, episode["kind"], episode["seed"], config.num_steps)
+        np.testing.assert_array_equal(states[index], run.states)
+        np.testing.assert_array_equal(actions[index], run.actions)
+        error = images[index].astype(float) - run.images
+        assert np.abs(error).mean() < 1.5  # of 255; a frame off by one step is off by more
+        assert 10 * np.log10(255**2 / np.mean(error**2)) > 40
+    env.close()
+
+
+def test_items_are_single_frames_and_whole_episodes(dataset, recording, episodes):
+    config, _ = recording
+    item = dataset[config.num_steps + 7]
+    assert item["task"] == "open the door"
+    np.testing.assert_array_equal(item[CAMERA].permute(1, 2, 0).numpy(), episodes[0][1, 7])
+    steps = [step / 10 for step in range(config.num_steps)]
+    windows = LeRobotDataset(
+        config.repo_id,
+        root=config.root,
+        video_backend="pyav",
+        delta_timestamps={CAMERA: steps, "action": steps},
+        return_uint8=True,
+    )
+    item = windows[2 * config.num_steps]
+    np.testing.assert_array_equal(item[CAMERA].permute(0, 2, 3, 1).numpy(), episodes[0][2])
+    np.testing.assert_array_equal(item["action"].numpy(), episodes[2][2])
+    assert not item["action_is_pad"].any()
+
+
+def test_decoded_dataset_is_the_same_for_every_kind_before_the_branch(recording, episodes):
+    _, report = recording
+    images, states, actions = episodes
+    for index, episode in enumerate(report.episodes):
+        twin, branch = index - index % 3, episode["branch_step"]
+        np.testing.assert_array_equal(actions[index, :branch], actions[twin, :branch])
+        np.testing.assert_array_equal(states[index, : branch + 1], states[twin, : branch + 1])
+        np.testing.assert_array_equal(images[index, : branch + 1], images[twin, : branch + 1])
+
+
+def kind_accuracy(recording, episodes, offsets):
+    """Leave-one-seed-out accuracy at telling the kind from frames and joints some steps from the branch."""
+    _, report = recording
+    images, states, _ = episodes
+    inputs, kinds, seeds = [], [], []
+    for index, episode in enumerate(report.episodes):
+        for offset in offsets:
+            step = episode["branch_step"] + offset
+            inputs.append(np.concatenate([images[index, step, ::4, ::4].ravel() / 255, states[index, step]]))
+            kinds.append(episode["kind"])
+            seeds.append(episode["seed"])
+    classifier = make_pipeline(StandardScaler(), LogisticRegression(max_iter=200))
+    return cross_val_score(classifier, np.stack(inputs), kinds, groups=seeds, cv=LeaveOneGroupOut()).mean()
+
+
+def test_a_classifier_finds_the_kind_after_the_branch_only(recording, episodes):
+    assert kind_accuracy(recording, episodes, range(-40, 1, 4)) == pytest.approx(1 / 3)
+    assert kind_accuracy(recording, episodes, range(20, 40, 4)) > 0.9
+
+
+def test_later_frames_leave_no_trace_in_the_video_of_earlier_ones(tmp_path, recording):
+    _, report = recording
+    env = DoorEnv()
+    push, pull = (demonstrate(env, kind, report.episodes[0]["seed"], 110) for kind in ("push", "pull"))
+    env.close()
+    branch = push.branch_step
+
+    def decoded_difference(encoder):
+        decoded = []
+        for run in (push, pull):
+            folder = tmp_path / run.kind
+            folder.mkdir(exist_ok=True)
+            for step, image in enumerate(run.images):
+                Image.fromarray(image).save(folder / f"frame-{step:06d}.png")
+            path = tmp_path / f"{run.kind}.mp4"
+            encode_video_frames(folder, path, 10, encoder, overwrite=True, log_level=None)
+            times = [step / 10 for step in range(branch)]
+            decoded.append(decode_video_frames(path, times, 1e-4, "pyav", return_uint8=True).int())
+        return (decoded[0] - decoded[1]).abs().max()
+
+    assert decoded_difference(FrameEncoderConfig()) == 0
+    # The test itself is sharp enough to see what an ordinary encoder, which looks ahead, gives away.
+    assert decoded_difference(RGBEncoderConfig(vcodec="h264", g=50, crf=23)) > 10
+
+
+def test_provenance_names_seeds_and_kinds_but_no_frame_does(recording, dataset):
+    config, report = recording
+    provenance = json.loads((config.root / "meta" / "door_recording.json").read_text())
+    assert provenance["episodes"] == [{"kind": e["kind"], "seed": e["seed"]} for e in report.episodes]
+    assert set(dataset[0]) == {CAMERA, "observation.state", "action", "task", "task_index"} | {
+        "timestamp",
+        "frame_index",
+        "episode_index",
+        "index",
+    }

@@ -1,0 +1,75 @@
+import pytest
+import torch
+from torchvision.transforms.v2.functional import resize
+
+from lerobot_ufrnn.networks import ConvAutoencoder, ImageEncoder
+
+
+@pytest.mark.parametrize("size", [(32, 32), (33, 47), (128, 128), (30, 64)])
+def test_reconstruction_has_the_size_of_the_image(size):
+    autoencoder = ConvAutoencoder(size, 4, (4, 4, 4), 8)
+    features = autoencoder.encode(torch.rand(2, 3, *size))
+    assert features.shape == (2, 4)
+    assert (features.abs() <= 1).all()
+    assert autoencoder.decode(features).shape == (2, 3, *size)
+
+
+def test_the_first_reconstruction_is_the_background():
+    images = torch.rand(6, 3, 32, 32)
+    autoencoder = ConvAutoencoder((32, 32), 4, (4, 4), 8)
+    autoencoder.fit_background(images)
+    reconstruction = autoencoder.decode(autoencoder.encode(images))
+    torch.testing.assert_close(reconstruction, images.mean(0).expand_as(images), atol=1e-5, rtol=0)
+
+
+def test_it_learns_where_a_bright_square_is():
+    """A moving square has variance about its mean image; a trained autoencoder explains nearly all of it."""
+    torch.manual_seed(0)
+    images = torch.zeros(24, 3, 32, 32)
+    for index in range(24):
+        images[index, :, 12:20, index : index + 8] = 1
+    autoencoder = ConvAutoencoder((32, 32), 3, (8, 8, 8), 16)
+    autoencoder.fit_background(images)
+    optimizer = torch.optim.Adam(autoencoder.parameters(), lr=3e-3)
+    for _ in range(300):
+        loss = (autoencoder.decode(autoencoder.encode(images)) - images).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert loss < 0.25 * images.var(dim=0, unbiased=False).mean()
+
+
+def make_encoder() -> ImageEncoder:
+    encoder = ImageEncoder(("observation.images.a", "observation.images.b"), (32, 32), 4, (4, 4), 8)
+    encoder.scaler.fit(torch.full((8,), -0.5), torch.full((8,), 0.5))
+    return encoder
+
+
+def test_each_camera_fills_its_own_features():
+    encoder = make_encoder()
+    images = {camera: torch.rand(2, 3, 32, 32) for camera in encoder.cameras}
+    other = {**images, "observation.images.b": torch.rand(2, 3, 32, 32)}
+    first, second = encoder(images), encoder(other)
+    assert torch.equal(first[:, :4], second[:, :4])
+    assert not torch.equal(first[:, 4:], second[:, 4:])
+
+
+def test_uint8_and_float_images_mean_the_same():
+    encoder = make_encoder()
+    pixels = {camera: torch.randint(0, 256, (2, 3, 32, 32), dtype=torch.uint8) for camera in encoder.cameras}
+    torch.testing.assert_close(encoder(pixels), encoder({key: value / 255 for key, value in pixels.items()}))
+
+
+def test_images_of_another_size_are_resized():
+    encoder = make_encoder()
+    large = {camera: torch.rand(1, 3, 120, 160) for camera in encoder.cameras}
+    small = {key: resize(value, [32, 32], antialias=True) for key, value in large.items()}
+    torch.testing.assert_close(encoder(large), encoder(small), atol=1e-5, rtol=0)
+
+
+def test_decode_undoes_the_scaling_of_the_features():
+    encoder = make_encoder()
+    images = {camera: torch.rand(2, 3, 32, 32) for camera in encoder.cameras}
+    for camera, autoencoder in zip(encoder.cameras, encoder.autoencoders, strict=True):
+        expected = autoencoder.decode(autoencoder.encode(images[camera]))
+        torch.testing.assert_close(encoder.decode(encoder(images))[camera], expected)

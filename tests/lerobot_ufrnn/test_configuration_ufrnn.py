@@ -1,0 +1,89 @@
+import pytest
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_policy_config
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_ufrnn import UFRNNConfig
+from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
+
+
+def test_lerobot_discovers_the_plugin():
+    register_third_party_plugins()
+    assert PreTrainedConfig.get_choice_class("ufrnn") is UFRNNConfig
+    assert get_policy_class("ufrnn") is UFRNNPolicy
+    assert make_policy_config("ufrnn", num_samples=7).num_samples == 7
+
+
+def test_the_defaults_are_the_papers():
+    config = UFRNNConfig()
+    assert (config.num_samples, config.horizon, config.noise_range) == (5, 10, (0.05, 0.15))
+    assert (config.joint_hidden_dim, config.image_hidden_dim, config.shared_hidden_dim, config.feature_dim) == (
+        50,
+        50,
+        20,
+        10,
+    )
+
+
+def test_a_saved_configuration_loads_equal(tmp_path):
+    config = UFRNNConfig(noise_range=(0.1, 0.2), conv_channels=(8, 8), exploration="noise", device="cpu")
+    config._save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path) == config
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "allowed"),
+    [
+        ("exploration", "curiosity", "foresight"),
+        ("noise_unit", "metres", "variance"),
+        ("noise_scale", "cubic", "log"),
+        ("perturbed_states", "everything", "hidden_and_cell"),
+        ("variance_baseline", "mine", "candidate"),
+        ("variance_aggregation", "max", "entropy"),
+        ("horizon_mode", "infinite", "learned"),
+        ("joint_target", "torque", "next_state"),
+        ("num_samples", 0, "at least 1"),
+        ("horizon", -3, "at least 1"),
+        ("shared_hidden_dim", 0, "at least 1"),
+        ("autoencoder_steps", 0, "at least 1"),
+        ("stall_steps", 0, "at least 1"),
+        ("image_shift", -1, "at least 0"),
+        ("input_noise", -0.1, "from 0"),
+        ("image_noise", 1.5, "below 1"),
+        ("stall_probability", 1.2, "from 0 to 1"),
+        ("stall_stretch", 0.5, "at least 1"),
+        ("optimizer_lr", 0.0, "above 0"),
+        ("optimizer_lr", float("nan"), "above 0"),
+        ("noise_range", (0.2, 0.1), "low <= high"),
+        ("noise_range", (-0.1, 0.1), "low <= high"),
+        ("noise_range", (0.1,), "two numbers"),
+        ("log_variance_range", (3.0, -9.0), "low < high"),
+        ("image_size", (8, 128), "at least 16 x 16"),
+        ("conv_channels", (8,) * 9, "halved"),
+        ("conv_channels", (), "halved"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_with_what_is_allowed(field, value, allowed):
+    with pytest.raises(ValueError, match=f"`{field}` must .*{allowed}"):
+        UFRNNConfig(**{field: value})
+
+
+STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (7,))}
+IMAGE = {"observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 64, 64))}
+ACTION = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "message"),
+    [
+        (IMAGE, ACTION, "needs 'observation.state'"),
+        (STATE, ACTION, "at least one camera"),
+        (STATE | IMAGE, {}, "needs 'action'"),
+        (STATE | IMAGE, {"action": PolicyFeature(FeatureType.ACTION, (6,))}, "the same joints"),
+        (STATE | {"observation.images.d": PolicyFeature(FeatureType.VISUAL, (1, 64, 64))}, ACTION, "colour image"),
+    ],
+)
+def test_unsuitable_features_are_refused(inputs, outputs, message):
+    config = UFRNNConfig(input_features=inputs, output_features=outputs)
+    with pytest.raises(ValueError, match=message):
+        config.validate_features()
