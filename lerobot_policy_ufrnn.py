@@ -1,3 +1,6 @@
 """LeRobot's discovery hook: importing this module registers the policy type `ufrnn` and the environment type `door`."""
 
-import lerobot_ufrnn.configuration_ufrnn  # noqa: F401
+from env_door.configuration_door import DoorEnvConfig
+from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
+
+__all__ = ["DoorEnvConfig", "UFRNNConfig"]

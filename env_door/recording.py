@@ -9,10 +9,10 @@ recording, the dataset on disk is readable and holds whole, matched episodes.
 """
 
 import contextlib
-import json
 import logging
+import shutil
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,13 @@ from tqdm import tqdm
 
 from env_door.demonstration import Demonstration, demonstrate
 from env_door.env import DoorEnv
+from env_door.provenance import Provenance
 from env_door.recording_config import ROBOT_TYPES, RecordConfig
 from env_door.staging import StagedDirectory
 
 logger = logging.getLogger(__name__)
 
 CAMERA = f"{OBS_IMAGES}.front"
-PROVENANCE_PATH = Path("meta/door_recording.json")
 MAX_DROPS_IN_A_ROW = 20
 
 
@@ -59,30 +59,6 @@ class RecordReport:
     seconds: float = 0.0
 
 
-@dataclass
-class Provenance:
-    """How the episodes of a dataset came about; kept beside its metadata so that a recording can go on.
-
-    Args:
-        settings (`dict`):
-            Options that all episodes share.
-        episodes (`list[dict]`):
-            `kind` and `seed` of each episode.
-        dropped_seeds (`list[int]`):
-            Seeds that were tried and not used.
-    """
-
-    settings: dict[str, Any]
-    episodes: list[dict[str, Any]] = field(default_factory=list)
-    dropped_seeds: list[int] = field(default_factory=list)
-
-    @property
-    def next_seed(self) -> int:
-        """First seed that has not been tried."""
-        used = [episode["seed"] for episode in self.episodes] + self.dropped_seeds
-        return max(used, default=self.settings["seed"] - 1) + 1
-
-
 def record(config: RecordConfig) -> RecordReport:
     """Record demonstrations of the scripted expert, push the dataset to the Hub if asked, and report.
 
@@ -102,7 +78,7 @@ def record(config: RecordConfig) -> RecordReport:
     env = DoorEnv(kind=config.kinds[0], arm=config.arm, door_offset=config.door_offset)
     try:
         with StagedDirectory(config.path) as directory:
-            provenance = _open(config)
+            provenance = Provenance.open(config)
             report = RecordReport(config.path, dropped_seeds=provenance.dropped_seeds)
             try:
                 _record_missing(config, env, directory, provenance, report)
@@ -126,30 +102,6 @@ def record(config: RecordConfig) -> RecordReport:
     return report
 
 
-def _open(config: RecordConfig) -> Provenance:
-    root = config.path
-    settings = json.loads(json.dumps(config.settings))
-    if not root.exists() or not any(root.iterdir()):
-        return Provenance(settings)
-    if not config.resume:
-        raise FileExistsError(
-            f"{root} is not empty. Use --resume=true to go on with the recording in it, or choose another root."
-        )
-    try:
-        provenance = Provenance(**json.loads((root / PROVENANCE_PATH).read_text()))
-    except FileNotFoundError as error:
-        raise ValueError(
-            f"{root} holds no recording of the door to go on with: {PROVENANCE_PATH} is missing. Choose another root."
-        ) from error
-    for name, value in settings.items():
-        if provenance.settings.get(name) != value:
-            raise ValueError(
-                f"{root} was recorded with {name}={provenance.settings.get(name)}, now {name}={value} is asked for. "
-                "Go on with the recorded value, or choose another root."
-            )
-    return provenance
-
-
 def _record_missing(
     config: RecordConfig,
     env: DoorEnv,
@@ -165,7 +117,7 @@ def _record_missing(
             with directory.change() as staged:
                 _write_episodes(config, env, staged, group)
                 after = replace(provenance, episodes=provenance.episodes + sources)
-                (staged / PROVENANCE_PATH).write_text(json.dumps(asdict(after), indent=4))
+                after.write(staged)
             for demonstration in group:
                 report.episodes.append(
                     {
@@ -205,11 +157,11 @@ def _demonstrate_group(
     )
 
 
-def _write_episodes(config: RecordConfig, env: DoorEnv, root: Path, group: list[Demonstration]) -> None:
+def _write_episodes(config: RecordConfig, env: DoorEnv, staged: Path, group: list[Demonstration]) -> None:
     # LeRobot hands libav's messages over to the terminal, at libav's own level.
     av.logging.set_libav_level(av.logging.ERROR)
     options = {
-        "root": root,
+        "root": staged,
         "rgb_encoder": config.rgb_encoder,
         # LeRobot's way over image files passes over those that it could not write; the stream to the encoder does not,
         # and it drops no frame when its queue holds the whole episode.
@@ -219,7 +171,7 @@ def _write_episodes(config: RecordConfig, env: DoorEnv, root: Path, group: list[
         # LeRobot's own choice warns at length where torchcodec is installed but cannot load.
         "video_backend": "pyav",
     }
-    if root.exists():
+    if staged.exists():
         dataset = LeRobotDataset.resume(config.repo_id, **options)
     else:
         dataset = LeRobotDataset.create(
@@ -237,13 +189,15 @@ def _write_episodes(config: RecordConfig, env: DoorEnv, root: Path, group: list[
                 dataset.add_frame({CAMERA: image, OBS_STATE: state, ACTION: action, "task": env.task_description})
             with SuppressProgressBars():
                 dataset.save_episode()
+        dataset.finalize()
     except BaseException:
-        # Close the files before their folder goes; what they hold is thrown away with it.
+        # LeRobot closes its files at the latest when it is garbage-collected, and makes their folder anew for that.
+        # Close them now, with the room on a full disk that this takes.
+        shutil.rmtree(staged, ignore_errors=True)
         with contextlib.suppress(Exception):
             dataset.finalize()
         raise
-    dataset.finalize()
-    _check_video(root, num_frames=len(group) * config.num_steps)
+    _check_video(staged, num_frames=len(group) * config.num_steps)
 
 
 def _check_video(root: Path, num_frames: int) -> None:

@@ -10,7 +10,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import draccus
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
 from env_door.latch import KINDS
@@ -19,6 +18,7 @@ from env_door.recording_config import RecordConfig
 from env_door.trials import Trial, read_trials
 
 from ..analysis.results import summarize, to_csv, to_markdown
+from .flags import parse_flags
 from .foresight import ForesightConfig, draw_trial
 
 REPO_ID = "ufrnn/door_demo"
@@ -106,7 +106,7 @@ class DemoConfig:
 def run(arguments: list[str]) -> None:
     """Runs all stages that are not done yet and shows the result."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    config = draccus.parse(DemoConfig, args=arguments)
+    config = parse_flags(DemoConfig, arguments)
     seconds = {}
     for number, (name, stage) in enumerate(
         (("record", _record), ("train", _train), ("evaluate", _evaluate), ("draw", _draw)), start=1

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import draccus
 import gymnasium as gym
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ import env_door  # noqa: F401  registers the environment
 
 from ..analysis.foresight_picture import TrialHistory, draw
 from ..modeling_ufrnn import UFRNNPolicy
+from .flags import parse_flags
 
 
 @dataclass
@@ -50,7 +50,7 @@ class ForesightConfig:
 
 def run(arguments: list[str]) -> None:
     """Runs the trial and writes the picture."""
-    config = draccus.parse(ForesightConfig, args=arguments)
+    config = parse_flags(ForesightConfig, arguments)
     draw_trial(config)
     print(f"Foresight at the branch: {config.output}")
 

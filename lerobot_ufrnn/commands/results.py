@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import draccus
-
 from env_door.trials import read_trials
 
 from ..analysis.results import summarize, to_csv, to_markdown
+from .flags import parse_flags
 
 
 @dataclass
@@ -27,7 +26,7 @@ class ResultsConfig:
 
 def run(arguments: list[str]) -> None:
     """Prints the table, and writes it when asked to."""
-    config = draccus.parse(ResultsConfig, args=arguments)
+    config = parse_flags(ResultsConfig, arguments)
     rows = summarize(read_trials(config.trial_log))
     if config.output_dir is not None:
         config.output_dir.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,8 @@ from sklearn.preprocessing import StandardScaler
 
 from env_door.demonstration import demonstrate
 from env_door.env import DoorEnv
-from env_door.recording_config import FrameEncoderConfig
+from env_door.recording import record
+from env_door.recording_config import FrameEncoderConfig, RecordConfig
 
 CAMERA = "observation.images.front"
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper"]
@@ -165,3 +166,13 @@ def test_provenance_names_seeds_and_kinds_but_no_frame_does(recording, dataset):
         "episode_index",
         "index",
     }
+
+
+def test_panda_has_its_own_joints(tmp_path):
+    config = RecordConfig("tester/panda", root=tmp_path / "door", episodes_per_kind=1, kinds=["pull"], arm="panda")
+    record(config)
+    dataset = LeRobotDataset(config.repo_id, root=config.root, video_backend="pyav")
+    names = [f"joint_{number}.pos" for number in range(1, 8)] + ["gripper.pos"]
+    assert dataset.features["action"]["names"] == dataset.features["observation.state"]["names"] == names
+    assert dataset.meta.robot_type == "panda"
+    assert dataset[149]["action"].shape == (8,)

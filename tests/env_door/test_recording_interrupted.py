@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import gc
 import json
 import os
 import random
@@ -16,6 +17,7 @@ from pathlib import Path
 import draccus
 import numpy as np
 import pytest
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
@@ -136,6 +138,22 @@ def test_full_disk_keeps_the_saved_episodes(tmp_path, expert):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert os.listdir(tmp_path) == ["door"]
     assert files(root) == before
+
+
+def test_full_disk_at_the_last_file_leaves_nothing_behind(tmp_path, expert, monkeypatch):
+    root = tmp_path / "door"
+    original = LeRobotDatasetMetadata._flush_metadata_buffer
+
+    def flush_if_there_is_room(metadata):
+        if (metadata.root / "videos").exists():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        original(metadata)
+
+    monkeypatch.setattr(LeRobotDatasetMetadata, "_flush_metadata_buffer", flush_if_there_is_room)
+    with pytest.raises(OSError, match="No space left"):
+        record(configure(root))
+    gc.collect()  # LeRobot writes once more when it is collected
+    assert os.listdir(tmp_path) == []
 
 
 def test_lost_frames_are_noticed(tmp_path, expert, monkeypatch):

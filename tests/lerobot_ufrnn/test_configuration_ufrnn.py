@@ -1,14 +1,17 @@
 import pytest
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.envs import EnvConfig
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from env_door.configuration_door import DoorEnvConfig
 from lerobot_ufrnn import UFRNNConfig
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
 
 
 def test_lerobot_discovers_the_plugin():
     register_third_party_plugins()
+    assert EnvConfig.get_choice_class("door") is DoorEnvConfig
     assert PreTrainedConfig.get_choice_class("ufrnn") is UFRNNConfig
     assert get_policy_class("ufrnn") is UFRNNPolicy
     assert make_policy_config("ufrnn", num_samples=7).num_samples == 7

@@ -1,0 +1,81 @@
+"""How the episodes of a recording came about, kept beside the dataset's metadata so that a recording can go on."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from env_door.recording_config import RecordConfig
+
+PROVENANCE_PATH = Path("meta/door_recording.json")
+
+
+@dataclass
+class Provenance:
+    """Settings and seeds of a dataset.
+
+    Args:
+        settings (`dict`):
+            Options that all episodes share.
+        episodes (`list[dict]`):
+            `kind` and `seed` of each episode.
+        dropped_seeds (`list[int]`):
+            Seeds that were tried and not used.
+    """
+
+    settings: dict[str, Any]
+    episodes: list[dict[str, Any]] = field(default_factory=list)
+    dropped_seeds: list[int] = field(default_factory=list)
+
+    @property
+    def next_seed(self) -> int:
+        """First seed that has not been tried."""
+        used = [episode["seed"] for episode in self.episodes] + self.dropped_seeds
+        return max(used, default=self.settings["seed"] - 1) + 1
+
+    @classmethod
+    def open(cls, config: RecordConfig) -> "Provenance":
+        """Read the provenance of the dataset to go on with, or start one.
+
+        Args:
+            config (`RecordConfig`):
+                What is to be recorded.
+
+        Returns:
+            `Provenance`: That of the episodes already in the folder.
+
+        Raises:
+            FileExistsError: If the folder holds something and `resume` is off.
+            ValueError: If the folder holds something else, or episodes recorded with other settings.
+        """
+        root = config.path
+        settings = json.loads(json.dumps(config.settings))
+        if not root.exists() or not any(root.iterdir()):
+            return cls(settings)
+        if not config.resume:
+            raise FileExistsError(
+                f"{root} is not empty. Use --resume=true to go on with the recording in it, or choose another root."
+            )
+        try:
+            provenance = cls(**json.loads((root / PROVENANCE_PATH).read_text()))
+        except FileNotFoundError as error:
+            raise ValueError(
+                f"{root} holds no recording of the door to go on with: {PROVENANCE_PATH} is missing. "
+                "Choose another root."
+            ) from error
+        for name, value in settings.items():
+            if provenance.settings.get(name) != value:
+                raise ValueError(
+                    f"{root} was recorded with {name}={provenance.settings.get(name)}, now {name}={value} is asked "
+                    "for. Go on with the recorded value, or choose another root."
+                )
+        return provenance
+
+    def write(self, root: Path) -> None:
+        """Write the provenance into a dataset.
+
+        Args:
+            root (`Path`):
+                Folder of the dataset.
+        """
+        (root / PROVENANCE_PATH).write_text(json.dumps(asdict(self), indent=4))

@@ -1,0 +1,25 @@
+"""Command-line flags in LeRobot's style, from a dataclass."""
+
+import draccus
+from draccus.utils import DecodingError, ParsingError
+
+
+def parse_flags[Config](config_class: type[Config], arguments: list[str]) -> Config:
+    """Builds a configuration from flags such as `--seed=3`.
+
+    Args:
+        config_class (`type`):
+            Dataclass whose fields are the flags.
+        arguments (`list[str]`):
+            Command line without program and command.
+
+    Returns:
+        The configuration.
+
+    Raises:
+        ValueError: If a value is of the wrong type or out of range; the message is the dataclass's own.
+    """
+    try:
+        return draccus.parse(config_class, args=arguments)
+    except (DecodingError, ParsingError) as error:
+        raise ValueError(str(error.__cause__ or error)) from error

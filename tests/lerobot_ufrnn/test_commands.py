@@ -1,0 +1,113 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from safetensors.torch import load_file
+
+from env_door.recording import record
+from env_door.recording_config import RecordConfig
+from lerobot_ufrnn.commands import COMMANDS, main
+
+
+def test_help_names_every_command(capsys):
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in COMMANDS)
+
+
+def test_an_unknown_command_is_refused(capsys):
+    assert main(["fly"]) == 2
+    assert "unknown command 'fly'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["results", "--trial_log=/nowhere/trials.jsonl"], "/nowhere/trials.jsonl"),
+        (["record", "--repo_id=me/door", "--kinds=[push,lift]"], "lift"),
+        (["record", "--repo_id=me/door", "--episodes_per_kind=0"], "episodes_per_kind"),
+        (["record", "--repo_id=me/door", "--door_offset=0.5"], "0.05"),
+        (["demo", "--trials_per_kind=0"], "--trials_per_kind must be at least 1"),
+        (["foresight", "--policy_path=/nowhere"], "/nowhere"),
+    ],
+)
+def test_a_bad_flag_ends_with_a_message_and_no_traceback(arguments, message, capsys):
+    assert main(arguments) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_results_writes_both_tables(tmp_path, capsys):
+    log = tmp_path / "trials.jsonl"
+    fields = {"seed": 1, "door_kind": "push", "success": True, "steps": 90, "opening": 1.1, "door_offset": 0.0}
+    log.write_text(json.dumps({**fields, "attempts": ["push"]}) + "\n")
+    assert main(["results", f"--trial_log={log}", f"--output_dir={tmp_path / 'out'}"]) == 0
+    assert (tmp_path / "out" / "results.md").read_text() in capsys.readouterr().out
+    assert (tmp_path / "out" / "results.csv").read_text().startswith("kind,trials,opened_150,opened_300")
+
+
+# ── LeRobot's own commands ────────────────────────────────────────────
+
+
+def lerobot(name: str, *flags: str) -> str:
+    """Runs a stock command as a user would and returns what it printed."""
+    command = [sys.executable, "-m", f"lerobot.scripts.lerobot_{name}", *flags]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stdout + result.stderr
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory) -> Path:
+    """One demonstration a door."""
+    root = tmp_path_factory.mktemp("commands") / "dataset"
+    record(RecordConfig(repo_id="test/door", root=root, episodes_per_kind=1, num_steps=100))
+    return root
+
+
+def train_flags(root: Path, output: Path) -> list[str]:
+    return [
+        "--policy.type=ufrnn",
+        "--policy.device=cpu",
+        "--policy.autoencoder_steps=2",
+        "--policy.horizon=2",
+        "--dataset.repo_id=test/door",
+        f"--dataset.root={root}",
+        "--dataset.video_backend=pyav",
+        "--batch_size=2",
+        "--num_workers=0",
+        f"--output_dir={output}",
+    ]
+
+
+def test_stock_training_resumes_and_stock_evaluation_reports_each_door(demonstrations, tmp_path):
+    # That a resumed run computes what an uninterrupted one would is shown in test_modeling_ufrnn.py.
+    run, last = tmp_path / "run", Path("checkpoints/last/pretrained_model")
+    lerobot("train", *train_flags(demonstrations, run), "--steps=3")
+    features = load_file(run / last / "model.safetensors")["image_encoder.scaler.high"]
+    lerobot("train", f"--config_path={run / last / 'train_config.json'}", "--resume=true", "--steps=5")
+    weights = load_file(run / last / "model.safetensors")
+    assert int(weights["updates"]) == 5
+    assert weights["image_encoder.scaler.high"].equal(features)
+
+    lerobot(
+        "eval",
+        f"--policy.path={run / last}",
+        "--env.type=door",
+        "--env.task=all",
+        "--env.episode_length=4",
+        f"--env.trial_log={tmp_path / 'trials.jsonl'}",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    info = json.loads((tmp_path / "eval" / "eval_info.json").read_text())
+    assert {task["task_group"] for task in info["per_task"]} == {"door_push", "door_pull", "door_slide"}
+    trials = [json.loads(line) for line in (tmp_path / "trials.jsonl").read_text().splitlines()]
+    assert sorted(trial["door_kind"] for trial in trials) == ["pull"] * 2 + ["push"] * 2 + ["slide"] * 2
+    assert all(trial["steps"] == 4 and not trial["success"] for trial in trials)
+
+    assert main(["foresight", f"--policy_path={run / last}", f"--output={tmp_path / 'f.png'}", "--num_steps=6"]) == 0
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
