@@ -41,8 +41,8 @@ class UFRNNConfig(PreTrainedConfig):
             kept future was least uncertain.
         noise_range (`tuple[float, float]`, *optional*, defaults to `(0.05, 0.15)`):
             Hidden-state noise at the least and at the most uncertain moment (Sec. III-C.1).
-        noise_unit (`str`, *optional*, defaults to `"variance"`):
-            Whether `noise_range` is a `variance`, as the notation N(H, f) says, or a `std`.
+        noise_unit (`str`, *optional*, defaults to `"std"`):
+            Whether `noise_range` is a `variance`, as the notation N(H, f) says, or a standard deviation (`std`).
         noise_scale (`str`, *optional*, defaults to `"linear"`):
             Whether f places the variance within its range on a `linear` or a `log` scale.
         perturbed_states (`str`, *optional*, defaults to `"hidden"`):
@@ -95,8 +95,9 @@ class UFRNNConfig(PreTrainedConfig):
 
         input_noise (`float`, *optional*, defaults to `0.02`):
             Standard deviation of noise on the recurrent network's inputs during training, in scaled units.
-        stall_probability (`float`, *optional*, defaults to `0.08`):
-            Probability per step that the observation stalls and its target waits (training only; 0 turns it off).
+        stall_probability (`float`, *optional*, defaults to `0.0`):
+            Probability per step that the observation stalls and its target waits (training only). Stalls tie progress
+            to what is seen; they also make episodes longer and learning slower.
         stall_steps (`int`, *optional*, defaults to `12`):
             Longest stall in steps.
         stall_stretch (`float`, *optional*, defaults to `1.3`):
@@ -117,7 +118,7 @@ class UFRNNConfig(PreTrainedConfig):
     horizon: int = 10
     horizon_mode: str = "fixed"
     noise_range: tuple[float, float] = (0.05, 0.15)
-    noise_unit: str = "variance"
+    noise_unit: str = "std"
     noise_scale: str = "linear"
     perturbed_states: str = "hidden"
     variance_baseline: str = "common"
@@ -143,7 +144,7 @@ class UFRNNConfig(PreTrainedConfig):
     image_noise: float = 0.02
 
     input_noise: float = 0.02
-    stall_probability: float = 0.08
+    stall_probability: float = 0.0
     stall_steps: int = 12
     stall_stretch: float = 1.3
     optimizer_lr: float = 1e-3

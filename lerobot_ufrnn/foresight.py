@@ -18,6 +18,7 @@ PERTURBED_STATES: dict[str, tuple[str, ...]] = {
     "hidden_and_cell": HiddenState._fields,
 }
 MODALITIES = ("joint", "image")
+RANGE_QUANTILES = (0.05, 0.95)
 
 
 def modality_means(values: Tensor, joint_dim: int) -> Tensor:
@@ -143,8 +144,9 @@ class NoiseSchedule(nn.Module):
     """`f`: maps the predicted variance of each modality to the standard deviation of the hidden-state noise.
 
     The variance is placed within the range it has lately run through, and that place within `[low, high]` of the noise.
-    The range follows training by an exponential moving average of each update's minimum and maximum: variances shrink
-    by orders of magnitude while a network learns, and a range that never forgot would switch exploration off.
+    The range follows training by an exponential moving average of two quantiles of each update: variances shrink by
+    orders of magnitude while a network learns, and a range that never forgot would switch exploration off; the true
+    extremes would let an episode's very first step, of which nothing can be known, dwarf all others.
 
     Args:
         noise_range (`tuple[float, float]`):
@@ -189,9 +191,9 @@ class NoiseSchedule(nn.Module):
 
     @torch.no_grad()
     def observe(self, variance: Tensor) -> None:
-        """Moves the range towards the extremes of `variance` (M, 2), one training update's worth of variances."""
+        """Moves the range towards that of `variance` (M, 2), one training update's worth of variances."""
         value = variance.log() if self.log_scale else variance
-        low, high = value.amin(0), value.amax(0)
+        low, high = value.quantile(value.new_tensor(RANGE_QUANTILES), dim=0)
         if not self.is_initialized:
             self.low.copy_(low)
             self.high.copy_(high)

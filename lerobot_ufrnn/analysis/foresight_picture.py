@@ -78,7 +78,7 @@ def draw(policy: UFRNNPolicy, history: TrialHistory, joint_names: tuple[str, ...
         top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.1)))
         panels = top.subplots(1, num_samples + 2)
         titles = [f"camera, step {step}", "reconstruction"]
-        titles += [f"future {n + 1}\nuncertainty {trace.final[n, 0]:.2g}" for n in range(num_samples)]
+        titles += [f"future {n + 1}\nuncertainty {trace.final[n, 0]:.3g}" for n in range(num_samples)]
         for index, (panel, picture, title) in enumerate(
             zip(panels, [history.images[step], reconstruction, *imagined], titles, strict=True)
         ):

@@ -30,7 +30,11 @@ def make_network(joint_dim=3, feature_dim=4, seed=0) -> SHLSTM:
 def make_schedule(**overrides) -> NoiseSchedule:
     schedule = NoiseSchedule(**{"noise_range": (0.05, 0.15), "noise_unit": "variance", "log_scale": False, **overrides})
     schedule.double()
-    schedule.observe(torch.tensor([[0.1, 0.2], [2.0, 3.0]], dtype=torch.float64))
+    low, high = torch.tensor([[0.1, 0.2], [2.0, 3.0]], dtype=torch.float64)
+    if schedule.log_scale:
+        low, high = low.log(), high.log()
+    schedule.low.copy_(low)
+    schedule.high.copy_(high)
     return schedule
 
 
@@ -235,11 +239,22 @@ def test_noise_on_a_log_scale():
     np.testing.assert_allclose(schedule(middle).numpy(), [0.1, 0.1], rtol=1e-12)
 
 
-def test_the_range_of_the_variance_follows_training():
-    schedule = make_schedule()
+def test_the_range_starts_with_the_first_update_and_follows_training():
+    schedule = NoiseSchedule((0.05, 0.15), "std", False).double()
+    early = torch.linspace(0, 10, 101, dtype=torch.float64)[:, None].expand(-1, 2)
+    schedule.observe(early)
+    np.testing.assert_allclose([schedule.low[0], schedule.high[0]], [0.5, 9.5])
     for _ in range(300):
-        schedule.observe(torch.tensor([[1e-3, 1e-3], [1e-2, 1e-2]], dtype=torch.float64))
-    np.testing.assert_allclose(schedule.high.numpy(), [1e-2, 1e-2], rtol=1e-3)
+        schedule.observe(early / 1000)
+    np.testing.assert_allclose([schedule.low[0], schedule.high[0]], [0.5e-3, 9.5e-3], rtol=1e-3)
+
+
+def test_one_outlier_does_not_set_the_range():
+    schedule = NoiseSchedule((0.05, 0.15), "std", False).double()
+    values = torch.ones(100, 2, dtype=torch.float64)
+    values[0] = 1000
+    schedule.observe(values)
+    np.testing.assert_allclose(schedule.high.numpy(), [1, 1])
 
 
 def test_an_episode_is_the_same_in_one_go_and_step_by_step():
