@@ -1,11 +1,16 @@
+from pathlib import Path
+
+import draccus
 import pytest
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs import EnvConfig
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from env_door.configuration_door import DoorEnvConfig
 from lerobot_ufrnn import UFRNNConfig
+from lerobot_ufrnn.commands.demo import DemoConfig
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
 
 
@@ -90,3 +95,26 @@ def test_unsuitable_features_are_refused(inputs, outputs, message):
     config = UFRNNConfig(input_features=inputs, output_features=outputs)
     with pytest.raises(ValueError, match=message):
         config.validate_features()
+
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.mark.parametrize(
+    ("name", "exploration"), [("ufrnn_paper", "foresight"), ("sh_rnn_noise_paper", "noise"), ("sh_rnn_paper", "none")]
+)
+def test_the_three_models_have_the_papers_values(name, exploration):
+    config = draccus.parse(TrainPipelineConfig, CONFIGS / f"{name}.yaml", args=[])
+    policy = config.policy
+    assert policy.exploration == exploration
+    assert (policy.num_samples, policy.horizon, policy.optimizer_lr, config.batch_size) == (5, 10, 1e-4, 5)
+    # 15 demonstrations in batches of 5 are 3 updates an epoch.
+    assert config.steps - policy.autoencoder_steps == 3 * 3000
+
+
+def test_our_own_configuration_is_the_default():
+    config = draccus.parse(TrainPipelineConfig, CONFIGS / "ufrnn.yaml", args=[])
+    assert config.policy == UFRNNConfig()
+    demo = DemoConfig()
+    assert (config.steps, config.batch_size, config.save_freq) == (demo.steps, demo.batch_size, demo.save_freq)
+    assert demo.autoencoder_steps == config.policy.autoencoder_steps
