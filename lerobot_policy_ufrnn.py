@@ -1,6 +1,18 @@
 """LeRobot's discovery hook: importing this module registers the policy type `ufrnn` and the environment type `door`."""
 
+import logging
+
 from env_door.configuration_door import DoorEnvConfig
 from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
 
 __all__ = ["DoorEnvConfig", "UFRNNConfig"]
+
+
+def _keep_last_line(record: logging.LogRecord) -> bool:
+    record.msg = str(record.msg).strip().splitlines()[-1].replace(" (see the error above)", "")
+    return True
+
+
+# Where FFmpeg's libraries are missing, LeRobot falls back to PyAV, which this project uses anyway, but first prints
+# sixty lines of torchcodec's attempts; the last one says it all.
+logging.getLogger("lerobot.utils.import_utils").addFilter(_keep_last_line)
