@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, _LazyAsyncVectorEnv, freeze_after_episode_end
@@ -62,7 +63,8 @@ class DoorEnvConfig(EnvConfig):
             File that gets one JSON line for every finished trial, see [`~env_door.trials.read_trials`].
 
     Raises:
-        ValueError: If a field is out of its range.
+        ParsingError: If a field is out of its range (the parser of LeRobot's command lines hides the text of a
+            ValueError).
     """
 
     task: str | None = "all"
@@ -84,19 +86,19 @@ class DoorEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         if self.task not in TASKS:
-            raise ValueError(f"--env.task must be one of {', '.join(TASKS)}, got {self.task!r}.")
+            raise ParsingError(f"--env.task must be one of {', '.join(TASKS)}, got {self.task!r}.")
         if self.fps != FPS:
-            raise ValueError(f"--env.fps must be {FPS}, the rate of the environment, got {self.fps}.")
+            raise ParsingError(f"--env.fps must be {FPS}, the rate of the environment, got {self.fps}.")
         if self.episode_length < 1:
-            raise ValueError(f"--env.episode_length must be at least 1 step, got {self.episode_length}.")
+            raise ParsingError(f"--env.episode_length must be at least 1 step, got {self.episode_length}.")
         if self.arm not in ARMS:
-            raise ValueError(f"--env.arm must be one of {', '.join(ARMS)}, got {self.arm!r}.")
+            raise ParsingError(f"--env.arm must be one of {', '.join(ARMS)}, got {self.arm!r}.")
         if not 0 <= self.door_offset <= MAX_OFFSET:
-            raise ValueError(f"--env.door_offset must be 0 to {MAX_OFFSET} m, got {self.door_offset}.")
+            raise ParsingError(f"--env.door_offset must be 0 to {MAX_OFFSET} m, got {self.door_offset}.")
         if not 0 <= self.start_variation <= 0.05:
-            raise ValueError(f"--env.start_variation must be 0 to 0.05 m, got {self.start_variation}.")
+            raise ParsingError(f"--env.start_variation must be 0 to 0.05 m, got {self.start_variation}.")
         if not 0.01 <= self.command_limit <= 1.0:
-            raise ValueError(f"--env.command_limit must be 0.01 to 1.0 rad, got {self.command_limit}.")
+            raise ParsingError(f"--env.command_limit must be 0.01 to 1.0 rad, got {self.command_limit}.")
         dimension = len(ARMS[self.arm].joints) + 1  # and the gripper
         self.features |= {
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(dimension,)),

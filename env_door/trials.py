@@ -10,7 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import draccus
 import gymnasium as gym
+from draccus.utils import ParsingError
 
 
 @dataclass(frozen=True)
@@ -130,13 +132,12 @@ def read_trials(path: str | Path) -> list[Trial]:
         ValueError: If a line is not a trial; the message names the line.
     """
     trials = []
-    for number, line in enumerate(Path(path).read_text().splitlines(), start=1):
+    for number, line in enumerate(Path(path).read_text(errors="replace").splitlines(), start=1):
         if not line.strip():
             continue
         try:
-            fields = json.loads(line)
-            trials.append(Trial(**{**fields, "attempts": tuple(fields["attempts"])}))
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            trials.append(draccus.decode(Trial, json.loads(line)))
+        except (json.JSONDecodeError, ParsingError, AttributeError) as error:
             raise ValueError(
                 f"{path}, line {number} is not a trial ({error}): {line[:80]!r}. "
                 "Each line must be a JSON object as written by env_door.trials.TrialLog: remove or repair this one."

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
+from draccus.utils import ParsingError
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
@@ -110,7 +111,7 @@ class UFRNNConfig(PreTrainedConfig):
             Read by LeRobot's sampler. Training sets it so that each episode is one item (see `UFRNNPolicy`).
 
     Raises:
-        ValueError: If a field is out of range.
+        ParsingError: If a field is out of range (the parser of LeRobot's command lines hides the text of a ValueError).
     """
 
     exploration: str = "foresight"
@@ -164,7 +165,7 @@ class UFRNNConfig(PreTrainedConfig):
         for name, allowed in CHOICES.items():
             value = getattr(self, name)
             if value not in allowed:
-                raise ValueError(f"`{name}` must be one of {list(allowed)}, got {value!r}.")
+                raise ParsingError(f"`{name}` must be one of {list(allowed)}, got {value!r}.")
         for name in (
             *("num_samples", "horizon", "joint_hidden_dim", "image_hidden_dim", "shared_hidden_dim"),
             *("feature_dim", "autoencoder_hidden_dim", "autoencoder_batch_size", "autoencoder_steps", "stall_steps"),
@@ -195,12 +196,12 @@ class UFRNNConfig(PreTrainedConfig):
     def _pair(self, name: str) -> tuple[float, float]:
         value = getattr(self, name)
         if len(value) != 2:
-            raise ValueError(f"`{name}` must hold two numbers, got {value}.")
+            raise ParsingError(f"`{name}` must hold two numbers, got {value}.")
         return value[0], value[1]
 
     def _require(self, name: str, condition: bool, allowed: str) -> None:
         if not condition:
-            raise ValueError(f"`{name}` must be {allowed}, got {getattr(self, name)}.")
+            raise ParsingError(f"`{name}` must be {allowed}, got {getattr(self, name)}.")
 
     @property
     def cameras(self) -> tuple[str, ...]:

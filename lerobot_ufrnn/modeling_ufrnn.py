@@ -131,7 +131,7 @@ class UFRNNPolicy(PreTrainedPolicy):
 
         Raises:
             ValueError: If an input is missing, has another shape or holds NaN, or the batch size changes mid-episode.
-            RuntimeError: If two threads share the policy, or it was never trained.
+            RuntimeError: If two threads share the policy, it was never trained, or its weights are not finite.
         """
         if threading.get_ident() != self._thread:
             raise RuntimeError(
@@ -144,7 +144,12 @@ class UFRNNPolicy(PreTrainedPolicy):
         if self.memory is None:
             self.memory = self.model.initial_memory(len(joints))
         self.memory, self.last_trace = self.model.advance(torch.cat((joints, features), dim=-1), self.memory)
-        return self.joint_scaler.unscale(self.memory.prediction.mean[:, : self.model.network.joint_dim])
+        action = self.joint_scaler.unscale(self.memory.prediction.mean[:, : self.model.network.joint_dim])
+        if not torch.isfinite(action).all():
+            raise RuntimeError(
+                "The policy predicts NaN or infinite joints: its weights are broken; train or load it anew."
+            )
+        return action
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """One-step chunk (B, 1, D_j) of `select_action`; the policy re-plans at every step by design."""

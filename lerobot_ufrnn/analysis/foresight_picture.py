@@ -39,10 +39,11 @@ class TrialHistory:
 
     @property
     def branch_step(self) -> int:
-        """`int`: the most uncertain step in the 1.5 s before the first try, or before the end if there was none."""
+        """`int`: where the imagined futures part most in the 2 s before the first try (before the end, without one)."""
         stop = (self.first_try if self.first_try is not None else len(self.traces) - 1) + 1
-        start = max(0, stop - 15)
-        return start + int(np.argmax([variance.sum() for variance in self.variances[start:stop]]))
+        start = max(0, stop - 20)
+        spreads = [trace.means[-1, :, 0].std(dim=0).mean().item() for trace in self.traces[start:stop]]
+        return start + int(np.argmax(spreads))
 
 
 def draw(policy: UFRNNPolicy, history: TrialHistory, joint_names: tuple[str, ...], path: Path) -> None:

@@ -2,6 +2,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
@@ -79,7 +80,7 @@ def test_policy_features(arm, dimension):
     ],
 )
 def test_bad_fields_are_refused(field, value, allowed):
-    with pytest.raises(ValueError, match=f"--env.{field}.*{allowed}"):
+    with pytest.raises(ParsingError, match=f"--env.{field}.*{allowed}"):
         DoorEnvConfig(**{field: value})
 
 

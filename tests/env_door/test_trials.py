@@ -99,10 +99,20 @@ def test_parallel_writers_do_not_mix_lines(tmp_path):
     assert sorted(seen.seed for seen in read_trials(path)) == list(range(64))
 
 
-@pytest.mark.parametrize("line", ["{", "[1]", '{"seed": 1}', '{"seed": 1, "attempts": [], "speed": 2}', "7"])
+GOOD_LINE = json.dumps(asdict(trial(("push",))))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("{", "[1]", "7", '{"seed": 1}', '{"seed": 1, "attempts": [], "speed": 2}'),
+        GOOD_LINE.replace('"steps": ', '"steps": "many", "ignored": '),
+        "\udcff",
+    ],
+)
 def test_broken_line_is_named(tmp_path, line):
     path = tmp_path / "trials.jsonl"
-    path.write_text(json.dumps(asdict(trial(("push",)))) + "\n" + line + "\n")
+    path.write_text(GOOD_LINE + "\n" + line + "\n", errors="surrogateescape")
     with pytest.raises(ValueError, match="line 2"):
         read_trials(path)
 

@@ -1,7 +1,9 @@
+from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
 import pytest
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs import EnvConfig
@@ -72,8 +74,21 @@ def test_a_saved_configuration_loads_equal(tmp_path):
     ],
 )
 def test_a_value_out_of_range_is_refused_with_what_is_allowed(field, value, allowed):
-    with pytest.raises(ValueError, match=f"`{field}` must .*{allowed}"):
+    with pytest.raises(ParsingError, match=f"`{field}` must .*{allowed}"):
         UFRNNConfig(**{field: value})
+
+
+def test_the_command_line_says_what_is_wrong():
+    """draccus replaces a ValueError by "Couldn't instantiate class"; ours must come through."""
+    with pytest.raises(ParsingError, match="`horizon` must be at least 1, got 0"):
+        draccus.parse(TrainPipelineConfig, args=["--dataset.repo_id=a/b", "--policy.type=ufrnn", "--policy.horizon=0"])
+    with pytest.raises(ParsingError, match="must be one of push, pull"):
+        draccus.parse(EvalConfig, args=["--env.type=door", "--env.task=lift"])
+
+
+@dataclass
+class EvalConfig:
+    env: EnvConfig
 
 
 STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (7,))}

@@ -162,6 +162,12 @@ def test_an_untrained_policy_says_so(dataset):
         policy.select_action(observation())
 
 
+def test_a_policy_whose_weights_are_nan_sends_nothing_to_the_robot(trained):
+    trained.model.network.joint_head.bias.data.fill_(float("nan"))
+    with pytest.raises(RuntimeError, match="its weights are broken"):
+        trained.select_action(observation())
+
+
 # ── Training ──────────────────────────────────────────────────────────
 
 
