@@ -119,7 +119,8 @@ def run(arguments: list[str]) -> None:
         seconds[name] = time.perf_counter() - start
     print(f"\n{(config.output_dir / 'results.md').read_text()}")
     print(", ".join(f"{name} {value:.0f} s" for name, value in seconds.items()))
-    print(f"Everything is in {config.output_dir}: results.md, results.csv, foresight.png, videos/, checkpoint/")
+    made = sorted(path.name + "/" * path.is_dir() for path in config.output_dir.iterdir())
+    print(f"Everything is in {config.output_dir}: {', '.join(made)}")
 
 
 def _record(config: DemoConfig) -> None:

@@ -1,0 +1,30 @@
+import json
+
+from env_door.trials import Trial
+from lerobot_ufrnn.commands.demo import DemoConfig, _first_of_each_kind, _keep_success_videos, _trained_steps
+
+
+def test_surplus_trials_of_the_last_batch_are_not_counted():
+    """lerobot-eval runs full batches and reports the first seeds; the log has all of them, in order of ending."""
+    trials = [Trial(seed, kind, True, 9, (kind,), 1.0, 0.0) for kind in ("slide", "push") for seed in (7, 5, 6)]
+    kept = _first_of_each_kind(trials, 2)
+    assert [(trial.door_kind, trial.seed) for trial in kept] == [("push", 5), ("push", 6), ("slide", 5), ("slide", 6)]
+
+
+def test_only_videos_of_opened_doors_are_kept(tmp_path):
+    config = DemoConfig(output_dir=tmp_path)
+    paths = [tmp_path / f"episode_{number}.mp4" for number in range(3)]
+    for path in paths:
+        path.write_text(path.name)
+    metrics = {"video_paths": [str(path) for path in paths], "successes": [False, True, True]}
+    config.eval_dir.mkdir()
+    (config.eval_dir / "eval_info.json").write_text(
+        json.dumps({"per_task": [{"task_group": "door_pull", "metrics": metrics}]})
+    )
+    _keep_success_videos(config)
+    kept = {path.name: path.read_text() for path in (tmp_path / "videos").iterdir()}
+    assert kept == {"door_pull_seed5001.mp4": "episode_1.mp4", "door_pull_seed5002.mp4": "episode_2.mp4"}
+
+
+def test_a_run_without_a_checkpoint_has_no_steps_to_go_on_from(tmp_path):
+    assert _trained_steps(DemoConfig(output_dir=tmp_path)) == 0
