@@ -2,19 +2,15 @@
 
 import logging
 import threading
-from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from huggingface_hub import hf_hub_download
-from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Generator, Tensor, nn
 
 from .augmentation import augment_images, stall_indices
+from .checkpoint import find_weights, read_weights
 from .configuration_ufrnn import UFRNNConfig
 from .episodes import Episode, EpisodeStore
 from .foresight import Foresight, ForesightTrace, NoiseSchedule, uncertainty
@@ -329,67 +325,21 @@ class UFRNNPolicy(PreTrainedPolicy):
     @classmethod
     def _load_as_safetensor(cls: type[T], model: T, model_file: str, map_location: str, strict: bool) -> T:
         """Loads weights and refuses a broken or foreign file: random layers would look like a bad policy."""
-        weights = _read_weights(model_file)
-        own = model.state_dict()
-        wrong = [
-            *(f"missing {key}" for key in sorted(own.keys() - weights.keys())),
-            *(f"unknown {key}" for key in sorted(weights.keys() - own.keys())),
-            *(
-                f"{key} has shape {tuple(weights[key].shape)} instead of {tuple(own[key].shape)}"
-                for key in sorted(own.keys() & weights.keys())
-                if own[key].shape != weights[key].shape
-            ),
-        ]
-        if wrong:
-            raise ValueError(
-                f"'{model_file}' does not fit this policy's configuration: {'; '.join(wrong[:5])}"
-                f"{' ...' if len(wrong) > 5 else ''}. Load it with the config.json it was saved with."
-            )
-        model.load_state_dict(weights)
+        model.load_state_dict(read_weights(model_file, expected=model.state_dict()))
         return model
 
     def _load_autoencoder(self, path: str) -> None:
         """Takes image encoder and feature range over from another `ufrnn` checkpoint."""
-        folder = Path(path).expanduser()
-        if folder.is_dir():
-            file = folder / SAFETENSORS_SINGLE_FILE
-        elif folder.exists() or path.count("/") != 1 or path.startswith((".", "/", "~")):
-            raise ValueError(
-                f"`autoencoder_path` must be a checkpoint folder or a Hub repository 'user/name', got '{path}'."
-            )
-        else:
-            file = Path(hf_hub_download(path, SAFETENSORS_SINGLE_FILE))
-        weights = {
-            key.removeprefix(ENCODER_PREFIX): value
-            for key, value in _read_weights(file).items()
-            if key.startswith(ENCODER_PREFIX)
-        }
-        try:
-            self.image_encoder.load_state_dict(weights)
-        except RuntimeError as error:
-            raise ValueError(
-                f"The autoencoder in '{path}' does not fit: it must have the same cameras, image_size, feature_dim and "
-                f"conv_channels as this policy. {error}"
-            ) from error
+        file = find_weights(path)
+        self.image_encoder.load_state_dict(
+            read_weights(file, expected=self.image_encoder.state_dict(), prefix=ENCODER_PREFIX)
+        )
         if not self.image_encoder.scaler.is_fitted:
             raise ValueError(
                 f"The autoencoder in '{path}' is not trained to its end; take a checkpoint of a run with at least "
                 "`autoencoder_steps` updates."
             )
         logger.info("Autoencoder taken over from %s.", path)
-
-
-def _read_weights(file: str | Path) -> dict[str, Tensor]:
-    try:
-        return load_file(file)
-    except FileNotFoundError as error:
-        raise FileNotFoundError(
-            f"There are no weights at '{file}'; give the folder that holds model.safetensors."
-        ) from error
-    except (SafetensorError, OSError) as error:
-        raise ValueError(
-            f"'{file}' is broken or not a safetensors file ({error}); copy or download it again."
-        ) from error
 
 
 def _frames_to_drop(lengths: list[int]) -> int:

@@ -89,8 +89,8 @@ def test_bad_fields_are_refused(field, value, allowed):
 )
 def test_the_environment_takes_the_extremes_that_the_configuration_allows(field_value):
     field, value = field_value
-    DoorEnvConfig(**{field: value})
-    DoorEnv(**{field: value})
+    config = DoorEnvConfig(**{field: value})
+    assert getattr(DoorEnv(**{field: getattr(config, field)}), field) == value
 
 
 def test_all_makes_one_suite_a_kind():

@@ -1,0 +1,76 @@
+"""Weights on disk: found, read, and checked against what is expected of them."""
+
+from pathlib import Path
+
+from huggingface_hub import hf_hub_download
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+
+def find_weights(path: str) -> Path:
+    """The weights of a checkpoint.
+
+    Args:
+        path (`str`):
+            Checkpoint folder, or Hub repository `user/name`.
+
+    Returns:
+        `Path`: its `model.safetensors`, downloaded where needed.
+
+    Raises:
+        ValueError: If it is neither.
+    """
+    folder = Path(path).expanduser()
+    if folder.is_dir():
+        return folder / SAFETENSORS_SINGLE_FILE
+    if folder.exists() or path.count("/") != 1 or path.startswith((".", "/", "~")):
+        raise ValueError(
+            f"`autoencoder_path` must be a checkpoint folder or a Hub repository 'user/name', got '{path}'."
+        )
+    return Path(hf_hub_download(path, SAFETENSORS_SINGLE_FILE))
+
+
+def read_weights(file: str | Path, expected: dict[str, Tensor], prefix: str = "") -> dict[str, Tensor]:
+    """Reads weights and checks names and shapes.
+
+    Args:
+        file (`str | Path`):
+            A safetensors file.
+        expected (`dict[str, Tensor]`):
+            Names and shapes that it must hold.
+        prefix (`str`, *optional*, defaults to `""`):
+            Read only the weights whose names begin with this, and drop it from their names.
+
+    Returns:
+        `dict[str, Tensor]`: the weights.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is broken, or holds the weights of another network.
+    """
+    try:
+        weights = load_file(file)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"There are no weights at '{file}'; give the folder that holds model.safetensors."
+        ) from error
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"'{file}' is broken or not a safetensors file ({error}); copy or download it again."
+        ) from error
+    weights = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
+    wrong = [f"missing {key}" for key in sorted(expected.keys() - weights.keys())]
+    wrong += [f"unknown {key}" for key in sorted(weights.keys() - expected.keys())]
+    wrong += [
+        f"{key} has shape {tuple(weights[key].shape)} instead of {tuple(expected[key].shape)}"
+        for key in sorted(expected.keys() & weights.keys())
+        if expected[key].shape != weights[key].shape
+    ]
+    if wrong:
+        raise ValueError(
+            f"'{file}' does not fit this policy's configuration: {'; '.join(wrong[:5])}"
+            f"{' ...' if len(wrong) > 5 else ''}. Load weights with the config.json they were saved with."
+        )
+    return weights
