@@ -99,6 +99,11 @@ class DoorEnvConfig(EnvConfig):
             raise ParsingError(f"--env.start_variation must be 0 to 0.05 m, got {self.start_variation}.")
         if not 0.01 <= self.command_limit <= 1.0:
             raise ParsingError(f"--env.command_limit must be 0.01 to 1.0 rad, got {self.command_limit}.")
+        if self.max_parallel_tasks != 1:
+            raise ParsingError(
+                f"--env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: drawing does not work in threads. "
+                "Use --eval.batch_size for parallel trials."
+            )
         dimension = len(ARMS[self.arm].joints) + 1  # and the gripper
         self.features |= {
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(dimension,)),

@@ -129,17 +129,26 @@ def read_trials(path: str | Path) -> list[Trial]:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If a line is not a trial; the message names the line.
+        ValueError: If a line is not a trial, or a trial occurs twice; the message names the line.
     """
-    trials = []
+    trials: list[Trial] = []
+    seen: set[tuple[str, int]] = set()
     for number, line in enumerate(Path(path).read_text(errors="replace").splitlines(), start=1):
         if not line.strip():
             continue
         try:
-            trials.append(draccus.decode(Trial, json.loads(line)))
+            trial = draccus.decode(Trial, json.loads(line))
         except (json.JSONDecodeError, ParsingError, AttributeError) as error:
             raise ValueError(
                 f"{path}, line {number} is not a trial ({error}): {line[:80]!r}. "
                 "Each line must be a JSON object as written by env_door.trials.TrialLog: remove or repair this one."
             ) from error
+        if trial.seed is not None:
+            if (trial.door_kind, trial.seed) in seen:
+                raise ValueError(
+                    f"{path}, line {number} repeats the trial {trial.door_kind}, seed {trial.seed}: the log holds more "
+                    "than one evaluation, perhaps one that was interrupted. Evaluate again into a new log."
+                )
+            seen.add((trial.door_kind, trial.seed))
+        trials.append(trial)
     return trials

@@ -346,10 +346,11 @@ def _frames_to_drop(lengths: list[int]) -> int:
     """Frames at each episode's end that LeRobot's sampler leaves out.
 
     Every frame that it may draw stands for its whole episode. Equal lengths: all frames but the first are left out, so
-    that an epoch holds each episode once. Unequal lengths: dropping one count from all would favour the long episodes
-    by far more than their length, so none are dropped and episodes come up in proportion to their length.
+    that an epoch holds each episode once. Unequal lengths: dropping such a count from all would favour the long
+    episodes by far more than their length, so only the last frame is left out, which has no next one to predict:
+    episodes come up in proportion to their length, and the sampler skips one of a single frame with a warning.
     """
-    return lengths[0] - 1 if len(set(lengths)) == 1 else 0
+    return lengths[0] - 1 if len(set(lengths)) == 1 else 1
 
 
 def _horizon_loss(prediction: Prediction, traces: list[ForesightTrace], mask: Tensor, joint_dim: int) -> Tensor:

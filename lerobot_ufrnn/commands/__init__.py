@@ -4,6 +4,8 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
+from draccus.utils import ParsingError
+
 COMMANDS = {
     "demo": "record, train, evaluate and draw: the whole path with one command",
     "record": "record demonstrations of the scripted expert into a LeRobotDataset",
@@ -42,9 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         run(rest)
     except KeyboardInterrupt:
-        print(f"\nufrnn {name}: interrupted; run the same command again to go on.", file=sys.stderr)
+        print(f"\nufrnn {name}: interrupted", file=sys.stderr)
         return 130
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, ParsingError) as error:
         print(f"ufrnn {name}: {error}", file=sys.stderr)
         return 1
     return 0

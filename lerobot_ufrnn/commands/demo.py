@@ -18,6 +18,7 @@ from env_door.recording_config import RecordConfig
 from env_door.trials import Trial, read_trials
 
 from ..analysis.results import summarize, to_csv, to_markdown
+from ..configuration_ufrnn import CHOICES
 from .flags import parse_flags
 from .foresight import ForesightConfig, draw_trial
 
@@ -68,6 +69,8 @@ class DemoConfig:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
+        if self.exploration not in CHOICES["exploration"]:
+            raise ValueError(f"--exploration must be one of {list(CHOICES['exploration'])}, got {self.exploration!r}.")
         for name in (
             "episodes_per_kind",
             "autoencoder_steps",
@@ -115,7 +118,11 @@ def run(arguments: list[str]) -> None:
     ):
         print(f"\n[{number}/4] {name}", flush=True)
         start = time.perf_counter()
-        stage(config)
+        try:
+            stage(config)
+        except KeyboardInterrupt:
+            print(f"\nStopped in stage '{name}'. Run the same command again to go on from there.", file=sys.stderr)
+            raise
         seconds[name] = time.perf_counter() - start
     print(f"\n{(config.output_dir / 'results.md').read_text()}")
     print(", ".join(f"{name} {value:.0f} s" for name, value in seconds.items()))

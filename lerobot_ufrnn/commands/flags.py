@@ -21,5 +21,7 @@ def parse_flags[Config](config_class: type[Config], arguments: list[str]) -> Con
     """
     try:
         return draccus.parse(config_class, args=arguments)
-    except (DecodingError, ParsingError) as error:
+    except DecodingError as error:  # a value of the wrong type: draccus names the flag
+        raise ValueError(str(error)) from error
+    except ParsingError as error:  # a value out of range: the dataclass says what is allowed, draccus does not
         raise ValueError(str(error.__cause__ or error)) from error

@@ -120,3 +120,11 @@ def test_broken_line_is_named(tmp_path, line):
 def test_missing_log_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_trials(tmp_path / "none.jsonl")
+
+
+def test_a_log_of_two_evaluations_is_refused(tmp_path):
+    """An interrupted evaluation that was started again must not count its trials twice."""
+    path = tmp_path / "trials.jsonl"
+    path.write_text(GOOD_LINE + "\n" + GOOD_LINE.replace('"push"', '"pull"') + "\n" + GOOD_LINE + "\n")
+    with pytest.raises(ValueError, match=r"line 3 repeats the trial push, seed \d+: .* more than one evaluation"):
+        read_trials(path)

@@ -29,7 +29,9 @@ def test_an_unknown_command_is_refused(capsys):
         (["record", "--repo_id=me/door", "--kinds=[push,lift]"], "lift"),
         (["record", "--repo_id=me/door", "--episodes_per_kind=0"], "episodes_per_kind"),
         (["record", "--repo_id=me/door", "--door_offset=0.5"], "0.05"),
+        (["record", "--repo_id=me/door", "--episodes_per_kind=abc"], "`episodes_per_kind`"),
         (["demo", "--trials_per_kind=0"], "--trials_per_kind must be at least 1"),
+        (["demo", "--exploration=magic"], "--exploration must be one of"),
         (["foresight", "--policy_path=/nowhere"], "/nowhere"),
     ],
 )
@@ -111,3 +113,12 @@ def test_stock_training_resumes_and_stock_evaluation_reports_each_door(demonstra
 
     assert main(["foresight", f"--policy_path={run / last}", f"--output={tmp_path / 'f.png'}", "--num_steps=6"]) == 0
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_an_interruption_leaves_with_the_usual_status(monkeypatch, capsys):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lerobot_ufrnn.commands.results.run", interrupted)
+    assert main(["results"]) == 130
+    assert "interrupted" in capsys.readouterr().err

@@ -226,8 +226,8 @@ def test_targets_are_the_next_sensor_values(dataset):
 
 def test_each_episode_is_one_item_of_the_sampler(dataset, uneven_dataset):
     assert make_policy(small_config(), ds_meta=dataset.meta).config.drop_n_last_frames == 11
-    # Unequal lengths: every frame stands for its episode, so that none is skipped.
-    assert make_policy(small_config(), ds_meta=uneven_dataset.meta).config.drop_n_last_frames == 0
+    # Unequal lengths: every frame that has a next one stands for its episode, so that none is skipped.
+    assert make_policy(small_config(), ds_meta=uneven_dataset.meta).config.drop_n_last_frames == 1
 
 
 def test_a_resumed_training_ends_with_the_same_weights(dataset, tmp_path):
