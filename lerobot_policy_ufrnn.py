@@ -9,7 +9,8 @@ __all__ = ["DoorEnvConfig", "UFRNNConfig"]
 
 
 def _keep_last_line(record: logging.LogRecord) -> bool:
-    record.msg = str(record.msg).strip().splitlines()[-1].replace(" (see the error above)", "")
+    if "torchcodec" in str(record.msg):
+        record.msg = str(record.msg).strip().splitlines()[-1].replace(" (see the error above)", "")
     return True
 
 

@@ -215,12 +215,12 @@ class UFRNNPolicy(PreTrainedPolicy):
             raise ValueError(f"A training batch must hold 'episode_index' (B,), got {sorted(batch)}.")
         if int(self.updates) == 0 and self.config.autoencoder_path is not None and self.training:
             self._load_autoencoder(self.config.autoencoder_path)
+        if not self.trains_autoencoder:
+            self.episodes.encode()
         episodes = [self.episodes[index] for index in batch["episode_index"].flatten().tolist()]
         generator = torch.Generator(self.updates.device).manual_seed(int(self.noise_seed) + int(self.updates))
         if self.trains_autoencoder:
             return self._autoencoder_loss(episodes, generator)
-        self._finish_autoencoder(self.episodes)
-        episodes = [self.episodes[index] for index in batch["episode_index"].flatten().tolist()]
         return self._recurrent_loss(episodes, generator)
 
     def update(self) -> None:
@@ -231,12 +231,11 @@ class UFRNNPolicy(PreTrainedPolicy):
             self._finish_autoencoder(self.episodes)
 
     def _finish_autoencoder(self, store: EpisodeStore) -> None:
-        """Encodes all frames once and, where it has none yet, sets the range of the features."""
+        """Encodes all frames once and sets the range of the features."""
         store.encode()
-        if not self.image_encoder.scaler.is_fitted:
-            features = torch.cat([episode.features for episode in store.loaded.values()])
-            self.image_encoder.scaler.fit(features.amin(0), features.amax(0))
-            logger.info("Autoencoder done: %d frames encoded; the recurrent network trains now.", len(features))
+        features = torch.cat([episode.features for episode in store.loaded.values()])
+        self.image_encoder.scaler.fit(features.amin(0), features.amax(0))
+        logger.info("Autoencoder done: %d frames encoded; the recurrent network trains now.", len(features))
 
     def _autoencoder_loss(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, dict[str, float]]:
         config, device = self.config, self.updates.device
