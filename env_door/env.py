@@ -113,6 +113,8 @@ class DoorEnv(gym.Env):
         self._doorway_home = self.model.body_pos[self._doorway].copy()
         self._target: NDArray[np.float64] = np.zeros(len(self.joint_names))
         self._renderers: dict[str, Renderer] = {}
+        self._picture: NDArray[np.uint8] | None = None
+        self._picture_poses: NDArray[np.float64] = np.empty(0)
 
         self.action_space = gym.spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32))
         image = gym.spaces.Box(0, 255, (self.observation_size, self.observation_size, 3), np.uint8)
@@ -159,7 +161,7 @@ class DoorEnv(gym.Env):
         joints = self.kinematics.solve(start, GRASP_ROTATION, np.array(self.arm.ready_pose))
         self.data.qpos[self._qpos] = joints
         self._target = np.append(joints, 0.0)
-        self._command(self._target, np.zeros_like(self._target))
+        self.data.ctrl[self._actuators] = self._control(self._target, np.zeros_like(self._target))
         mujoco.mj_forward(self.model, self.data)
         return self._observation(), self._info()
 
@@ -194,8 +196,9 @@ class DoorEnv(gym.Env):
         """
         start, target = self._target, self.limit_action(action)
         velocity = (target - start) / (CONTROL_STEPS * self.model.opt.timestep)
-        for substep in range(1, CONTROL_STEPS + 1):
-            self._command(start + (target - start) * (substep / CONTROL_STEPS), velocity)
+        progress = np.arange(1, CONTROL_STEPS + 1)[:, None] / CONTROL_STEPS
+        for control in self._control(start + (target - start) * progress, velocity):
+            self.data.ctrl[self._actuators] = control
             mujoco.mj_step(self.model, self.data)
             self.latch.update()
         self._target = target
@@ -254,7 +257,11 @@ class DoorEnv(gym.Env):
         Returns:
             `NDArray[np.uint8]`: picture, shape `(render_size, render_size, 3)`.
         """
-        return self._renderer("view").draw(self.data)
+        # LeRobot asks a finished environment for its picture until its whole batch is done: draw only what moved.
+        poses = np.concatenate([self.data.geom_xpos, self.data.geom_xmat], axis=1)
+        if self._picture is None or not np.array_equal(poses, self._picture_poses):
+            self._picture, self._picture_poses = self._renderer("view").draw(self.data), poses
+        return self._picture.copy()
 
     def close(self) -> None:
         """Frees the renderers."""
@@ -262,12 +269,12 @@ class DoorEnv(gym.Env):
             renderer.close()
         self._renderers.clear()
 
-    def _command(self, target: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
+    def _control(self, target: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
         # The target's own velocity is fed forward, so that a free arm follows closely although its gains are
         # soft and a gap between command and measurement means that something blocks it.
         control = target + self._servo_lag * velocity
-        control[-1] *= GRIPPER_STROKE
-        self.data.ctrl[self._actuators] = control
+        control[..., -1] *= GRIPPER_STROKE
+        return control
 
     def _check_physics(self) -> None:
         if not np.isfinite(self.data.qpos).all() or any(self.data.warning.number):
@@ -293,8 +300,8 @@ class DoorEnv(gym.Env):
 
     def _renderer(self, camera: str) -> Renderer:
         if camera not in self._renderers:
-            size, fine = (self.observation_size, False) if camera == "front" else (self.render_size, True)
-            self._renderers[camera] = make_renderer(self.model, camera, size, fine)
+            size, smooth = (self.observation_size, False) if camera == "front" else (self.render_size, True)
+            self._renderers[camera] = make_renderer(self.model, camera, size, smooth)
         return self._renderers[camera]
 
 

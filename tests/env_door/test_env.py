@@ -227,6 +227,34 @@ def test_held_door_stops_and_then_opens(env):
     assert info["is_success"]
 
 
+def test_picture_is_drawn_only_when_something_moved(env, monkeypatch):
+    env.reset(seed=0)
+    drawn = []
+    renderer = env._renderer("view")
+    draw = renderer.draw
+    monkeypatch.setattr(renderer, "draw", lambda data: drawn.append(data.time) or draw(data))
+    first = env.render()
+    again = env.render()
+    np.testing.assert_array_equal(first, again)
+    assert len(drawn) <= 1
+    again[:] = 0
+    np.testing.assert_array_equal(first, env.render(), err_msg="the caller owns what it got")
+
+    drawn.clear()
+    target = env.measured_joints()
+    target[0] += 0.05
+    for count in (1, 2):
+        env.step(target.astype(np.float32))
+        moved = env.render()
+        assert len(drawn) == count
+    assert (moved != first).any()
+    np.testing.assert_array_equal(moved, draw(env.data))
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), first)
+    env.reset(seed=0, options={"door_offset": 0.04})
+    assert (env.render() != first).any(), "the doorway is part of the picture"
+
+
 @pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
 def test_bad_hold_is_refused(env, seconds):
     env.reset(seed=0)

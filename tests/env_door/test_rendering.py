@@ -2,6 +2,7 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -118,11 +119,31 @@ def test_frames_repeat_exactly(env, opengl):
     np.testing.assert_array_equal(opengl.draw(env.data), opengl.draw(env.data))
 
 
-def test_policy_view_needs_no_shadows(env, opengl):
-    """Shadows and smooth edges cost more than a frame may take; the picture for people has them."""
-    plain = OpenGLRenderer(env.model, "view", 128)
-    fine = OpenGLRenderer(env.model, "view", 128, fine=True)
-    assert (plain.draw(env.data) != fine.draw(env.data)).any()
-    assert env.model.vis.quality.offsamples == 0, "the model must come back unchanged"
+@pytest.mark.parametrize("size", [100, 101, 768])
+def test_smooth_picture_is_the_plain_one_with_softer_edges(env, opengl, size):
+    plain = OpenGLRenderer(env.model, "view", size)
+    smooth = OpenGLRenderer(env.model, "view", size, smooth=True)
+    first, second = plain.draw(env.data).astype(int), smooth.draw(env.data)
+    assert second.shape == first.shape == (size, size, 3)
+    assert second.dtype == np.uint8
+    difference = np.abs(first - second).max(axis=-1)
+    assert 0.005 < (difference > 8).mean() < 0.1, "only edges differ"
+    assert len(np.unique(second.reshape(-1, 3), axis=0)) > len(np.unique(first.reshape(-1, 3), axis=0))
     plain.close()
-    fine.close()
+    smooth.close()
+
+
+def test_renderers_leave_the_model_unchanged(env, opengl):
+    before = env.model.vis.global_.offwidth, env.model.vis.global_.offheight
+    OpenGLRenderer(env.model, "view", 64, smooth=True).close()
+    assert (env.model.vis.global_.offwidth, env.model.vis.global_.offheight) == before
+
+
+def test_size_of_the_buffer_does_not_change_a_picture(env, opengl):
+    """Data recorded with a buffer of another size must stay comparable, bit by bit."""
+    reference = mujoco.Renderer(env.model, 128, 128)
+    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        reference.scene.flags[flag] = 0
+    reference.update_scene(env.data, "front")
+    np.testing.assert_array_equal(opengl.draw(env.data), reference.render())
+    reference.close()
