@@ -19,6 +19,7 @@ CHOICES = {
     "variance_aggregation": ("variance", "entropy"),
     "horizon_mode": ("fixed", "learned"),
     "joint_target": ("action", "next_state"),
+    "kernel": ("auto", "fast", "reference"),
 }
 
 
@@ -94,6 +95,9 @@ class UFRNNConfig(PreTrainedConfig):
         image_noise (`float`, *optional*, defaults to `0.02`):
             Standard deviation of pixel noise while training the autoencoder.
 
+        kernel (`str`, *optional*, defaults to `"auto"`):
+            What computes recurrence and foresight: `reference` is the readable PyTorch code, `fast` the same compiled
+            for the CPU (on whatever device the weights are), `auto` is `fast` where Numba can be imported.
         input_noise (`float`, *optional*, defaults to `0.02`):
             Standard deviation of noise on the recurrent network's inputs during training, in scaled units.
         stall_probability (`float`, *optional*, defaults to `0.0`):
@@ -144,6 +148,7 @@ class UFRNNConfig(PreTrainedConfig):
     image_jitter: float = 0.1
     image_noise: float = 0.02
 
+    kernel: str = "auto"
     input_noise: float = 0.02
     stall_probability: float = 0.0
     stall_steps: int = 12

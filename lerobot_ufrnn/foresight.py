@@ -5,6 +5,7 @@ candidate whose predicted variance falls most. `Foresight` joins them. Candidate
 `n * B + b` of a stacked tensor is candidate n of sequence b.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -50,7 +51,7 @@ def sample_noise(
     perturbed: tuple[str, ...],
     keep_unperturbed: bool = False,
     generator: Generator | None = None,
-) -> dict[str, Tensor]:
+) -> Tensor:
     """Standard normal noise for the perturbed states.
 
     Args:
@@ -59,47 +60,48 @@ def sample_noise(
         num_samples (`int`):
             Number of candidates N.
         perturbed (`tuple[str, ...]`):
-            Names of the `HiddenState` fields to perturb.
+            Names of the `HiddenState` fields to perturb, in their order.
         keep_unperturbed (`bool`, *optional*, defaults to `False`):
             Leave the first candidate as it is.
         generator (`torch.Generator`, *optional*):
             Source of randomness; PyTorch's global one when not given.
 
     Returns:
-        `dict[str, Tensor]`: field name to noise, (N, B, hidden size).
+        `Tensor`: noise of the perturbed fields side by side, (N, B, sum of their hidden sizes).
     """
-    sizes = [getattr(state, name).shape[-1] for name in perturbed]
+    size = sum(getattr(state, name).shape[-1] for name in perturbed)
     like = state.h_joint
-    joined = torch.randn(
-        num_samples, like.shape[0], sum(sizes), dtype=like.dtype, device=like.device, generator=generator
-    )
+    noise = torch.randn(num_samples, like.shape[0], size, dtype=like.dtype, device=like.device, generator=generator)
     if keep_unperturbed:
-        joined[0] = 0
-    return dict(zip(perturbed, joined.split(sizes, dim=-1), strict=True))
+        noise[0] = 0
+    return noise
 
 
-def perturb(state: HiddenState, noise: dict[str, Tensor], noise_std: Tensor) -> HiddenState:
+def perturb(state: HiddenState, noise: Tensor, noise_std: Tensor, perturbed: tuple[str, ...]) -> HiddenState:
     """Candidates `H^n ~ N(H_t, f(var))`.
 
     Args:
         state (`HiddenState`):
             H_t, (B, hidden size) each.
-        noise (`dict[str, Tensor]`):
-            Field name to standard normal noise, (N, B, hidden size).
+        noise (`Tensor`):
+            Standard normal noise of the perturbed fields side by side, (N, B, sum of their hidden sizes).
         noise_std (`Tensor`):
             Standard deviation for the joint and the image LSTM, (B, 2); the shared LSTM takes their mean.
+        perturbed (`tuple[str, ...]`):
+            Names of the `HiddenState` fields to perturb, in their order.
 
     Returns:
         `HiddenState`: stacked candidates, (N * B, hidden size) each.
     """
     std = {"joint": noise_std[:, :1], "image": noise_std[:, 1:], "shared": noise_std.mean(-1, keepdim=True)}
-    num_samples = next(iter(noise.values())).shape[0]
+    sizes = [getattr(state, name).shape[-1] for name in perturbed]
+    noise_of = dict(zip(perturbed, noise.split(sizes, dim=-1), strict=True))
 
     def candidates(name: str) -> Tensor:
         value = getattr(state, name)
-        if name not in noise:
-            return value.repeat(num_samples, 1)
-        return (value + std[name.split("_")[1]] * noise[name]).flatten(0, 1)
+        if name not in noise_of:
+            return value.repeat(len(noise), 1)
+        return (value + std[name.split("_")[1]] * noise_of[name]).flatten(0, 1)
 
     return HiddenState(*(candidates(name) for name in HiddenState._fields))
 
@@ -130,7 +132,7 @@ def select(baseline: Tensor, final: Tensor) -> Tensor:
 
     Args:
         baseline (`Tensor`):
-            Uncertainty now, (1, B) if common to all candidates or (N, B).
+            Uncertainty now, (N, B), or (1, B) if common to all candidates.
         final (`Tensor`):
             Uncertainty at the horizon, (N, B).
 
@@ -205,16 +207,18 @@ class NoiseSchedule(nn.Module):
 
 @dataclass(frozen=True)
 class ForesightTrace:
-    """What foresight saw at one step, for analysis.
+    """What foresight saw at one step, for analysis; of L steps, each tensor has a first dimension more.
 
     Attributes:
         noise_std (`Tensor`): standard deviation of the noise for the joint and the image LSTM, (B, 2).
         chosen (`Tensor`): index of the kept candidate, int64 (B,).
-        baseline (`Tensor`): uncertainty before foresight, (1, B), or (N, B) where each candidate has its own.
+        baseline (`Tensor`): uncertainty before foresight, (N, B).
         final (`Tensor`): uncertainty of each candidate at its horizon, (N, B).
         horizon (`Tensor`): number of imagined steps that counted, int64 (N, B).
-        means (`Tensor`): imagined scaled sensor values, (T, N, B, D).
-        log_variances (`Tensor`): their log-variances, (T, N, B, D).
+        calmest (`Tensor`, *optional*): number of imagined steps after which each candidate was least uncertain, int64
+            (N, B); only where the horizon is learned.
+        futures (`Prediction`, *optional*): what each candidate imagined, (T, N, B, ...); only the reference kernel
+            keeps it.
     """
 
     noise_std: Tensor
@@ -222,8 +226,49 @@ class ForesightTrace:
     baseline: Tensor
     final: Tensor
     horizon: Tensor
-    means: Tensor
-    log_variances: Tensor
+    calmest: Tensor | None
+    futures: Prediction | None
+
+    @classmethod
+    def stack(cls, traces: "Sequence[ForesightTrace]") -> "ForesightTrace":
+        """One trace of L steps from those of the reference kernel."""
+
+        def over_time(name: str) -> Tensor:
+            return torch.stack([getattr(trace, name) for trace in traces])
+
+        return cls(
+            over_time("noise_std"),
+            over_time("chosen"),
+            over_time("baseline"),
+            over_time("final"),
+            over_time("horizon"),
+            None if traces[0].calmest is None else over_time("calmest"),
+            Prediction(*map(torch.stack, zip(*(trace.imagined for trace in traces), strict=True))),
+        )
+
+    @property
+    def imagined(self) -> Prediction:
+        """`Prediction`: `futures`.
+
+        Raises:
+            RuntimeError: If they were not kept.
+        """
+        if self.futures is None:
+            raise RuntimeError("The fast kernel keeps no imagined futures; load the policy with kernel='reference'.")
+        return self.futures
+
+    def at(self, step: int) -> "ForesightTrace":
+        """The trace of one step of L."""
+        calmest, futures = self.calmest, self.futures
+        return ForesightTrace(
+            self.noise_std[step],
+            self.chosen[step],
+            self.baseline[step],
+            self.final[step],
+            self.horizon[step],
+            None if calmest is None else calmest[step],
+            None if futures is None else Prediction(*(values[step] for values in futures)),
+        )
 
 
 class Foresight(nn.Module):
@@ -301,14 +346,19 @@ class Foresight(nn.Module):
             return state, None
         with torch.no_grad():
             noise_std = self.schedule(modality_means(previous.log_variance.exp(), network.joint_dim))  # (B, 2)
-            noise = sample_noise(state, self.num_samples, self.perturbed, self.keep_unperturbed, generator)
+        noise = self.sample_noise(state, generator)  # (N, B, S)
         if self.exploration == "noise":
-            return perturb(state, noise, noise_std), None
+            return perturb(state, noise, noise_std, self.perturbed), None
         with torch.no_grad():
-            trace = self._imagine(network, perturb(state, noise, noise_std), previous, noise_std)
+            candidates = perturb(state, noise, noise_std, self.perturbed)
+            trace = self._imagine(network, candidates, previous, noise_std)
         sequences = torch.arange(trace.chosen.shape[0], device=trace.chosen.device)
-        chosen_noise = {name: value[trace.chosen, sequences].unsqueeze(0) for name, value in noise.items()}
-        return perturb(state, chosen_noise, noise_std), trace
+        chosen_noise = noise[trace.chosen, sequences].unsqueeze(0)
+        return perturb(state, chosen_noise, noise_std, self.perturbed), trace
+
+    def sample_noise(self, state: HiddenState, generator: Generator | None = None) -> Tensor:
+        """Noise for one step, (N, B, S): see [`sample_noise`]."""
+        return sample_noise(state, self.num_samples, self.perturbed, self.keep_unperturbed, generator)
 
     def _imagine(
         self, network: SHLSTM, candidates: HiddenState, previous: Prediction, noise_std: Tensor
@@ -318,20 +368,17 @@ class Foresight(nn.Module):
         def unstack(values: Tensor) -> Tensor:  # (..., N * B, D) -> (..., N, B, D)
             return values.unflatten(-2, (self.num_samples, batch_size))
 
-        futures = roll_out(network, candidates, self.horizon)
-        log_variances = unstack(futures.log_variance)  # (T, N, B, D)
-        horizon = torch.full((self.num_samples, batch_size), self.horizon, device=noise_std.device)
-        if self.baseline == "candidate" or self.learned_horizon:
+        futures = Prediction(*map(unstack, roll_out(network, candidates, self.horizon)))  # (T, N, B, ...)
+        uncertainties = uncertainty(futures.log_variance, network.joint_dim, self.aggregation)  # (T, N, B)
+        horizon, calmest = torch.full_like(uncertainties[0], self.horizon, dtype=torch.int64), None
+        baseline = uncertainty(previous.log_variance, network.joint_dim, self.aggregation).expand_as(horizon)
+        if self.learned_horizon or self.baseline == "candidate":
             now = network.predict(candidates)
         if self.learned_horizon:
             fraction = torch.sigmoid(unstack(now.step)).amax(-1)  # (N, B)
             horizon = (fraction * self.horizon).ceil().long().clamp(1, self.horizon)
-        reached = log_variances.gather(
-            0, (horizon - 1)[None, :, :, None].expand(1, -1, -1, log_variances.shape[-1])
-        ).squeeze(0)
-        final = uncertainty(reached, network.joint_dim, self.aggregation)  # (N, B)
-        start = unstack(now.log_variance) if self.baseline == "candidate" else previous.log_variance.unsqueeze(0)
-        baseline = uncertainty(start, network.joint_dim, self.aggregation)
-        return ForesightTrace(
-            noise_std, select(baseline, final), baseline, final, horizon, unstack(futures.mean), log_variances
-        )
+            calmest = uncertainties.argmin(0) + 1
+        if self.baseline == "candidate":
+            baseline = uncertainty(unstack(now.log_variance), network.joint_dim, self.aggregation)
+        final = uncertainties.gather(0, (horizon - 1).unsqueeze(0)).squeeze(0)
+        return ForesightTrace(noise_std, select(baseline, final), baseline, final, horizon, calmest, futures)

@@ -13,7 +13,7 @@ from .augmentation import augment_images, stall_indices
 from .checkpoint import find_weights, read_weights
 from .configuration_ufrnn import UFRNNConfig
 from .episodes import Episode, EpisodeStore
-from .foresight import Foresight, ForesightTrace, NoiseSchedule, uncertainty
+from .foresight import Foresight, ForesightTrace, NoiseSchedule
 from .networks import SHLSTM, ImageEncoder, Prediction, RangeScaler, gaussian_nll
 from .recurrent import UFRNN, Memory
 
@@ -74,7 +74,7 @@ class UFRNNPolicy(PreTrainedPolicy):
             config.autoencoder_hidden_dim,
         )
         self.joint_scaler = RangeScaler(joint_dim)
-        self.model = UFRNN(
+        self.model = _model_class(config.kernel)(
             SHLSTM(
                 joint_dim,
                 config.feature_dim * len(config.cameras),
@@ -169,9 +169,11 @@ class UFRNNPolicy(PreTrainedPolicy):
                 raise ValueError(
                     f"'{key}' must have shape (batch, {', '.join(map(str, shape))}), got {tuple(value.shape)}."
                 )
-            if value.is_floating_point() and not torch.isfinite(value).all():
+            # A sum that is finite clears all, ten times cheaper than asking each pixel.
+            if value.is_floating_point() and not torch.isfinite(value.sum()):
                 rows = (~torch.isfinite(value.flatten(1))).any(dim=1).nonzero().flatten().tolist()
-                raise ValueError(f"'{key}' holds NaN or infinite values in batch row(s) {rows}; check the sensor.")
+                if rows:
+                    raise ValueError(f"'{key}' holds NaN or infinite values in batch row(s) {rows}; check the sensor.")
         if self.memory is not None and (running := len(self.memory.state.h_joint)) != batch_size:
             raise ValueError(
                 f"The batch size changed from {running} to {batch_size} in mid-episode; call reset() at the start of "
@@ -260,7 +262,7 @@ class UFRNNPolicy(PreTrainedPolicy):
         if self.training:
             noise = torch.randn(inputs.shape, generator=generator, device=inputs.device)
             inputs = inputs + self.config.input_noise * noise
-        prediction, traces = self.model(inputs, generator)
+        prediction, trace = self.model(inputs, generator)
         nll = gaussian_nll(targets, prediction.mean, prediction.log_variance).sum(-1)  # (B, L)
         loss = nll[mask].mean()
         variance = self.model.modality_variance(prediction)[mask].detach()  # (M, 2)
@@ -275,12 +277,11 @@ class UFRNNPolicy(PreTrainedPolicy):
             "joint_variance": variance[:, 0].mean().item(),
             "feature_variance": variance[:, 1].mean().item(),
         }
-        if traces:
+        if trace is not None:
             # How much calmer the kept future is than the average candidate's: 0 would mean that selection does nothing.
-            final = torch.stack([trace.final for trace in traces])  # (L, N, B)
-            logs["foresight_gain"] = (1 - final.amin(1) / final.mean(1)).mean().item()
+            logs["foresight_gain"] = (1 - trace.final.amin(1) / trace.final.mean(1)).mean().item()
             if self.config.horizon_mode == "learned":
-                loss = loss + _horizon_loss(prediction, traces, mask, joint_dim)
+                loss = loss + _horizon_loss(prediction, trace, self.config.horizon, mask)
         return loss, logs
 
     def _sequences(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, Tensor, Tensor]:
@@ -352,30 +353,42 @@ def _frames_to_drop(lengths: list[int]) -> int:
     return lengths[0] - 1 if len(set(lengths)) == 1 else 1
 
 
-def _horizon_loss(prediction: Prediction, traces: list[ForesightTrace], mask: Tensor, joint_dim: int) -> Tensor:
+def _horizon_loss(prediction: Prediction, trace: ForesightTrace, horizon: int, mask: Tensor) -> Tensor:
     """Teaches the step scalars at which imagined step the kept future was least uncertain.
 
     Args:
         prediction (`Prediction`):
             Predictions over time, (B, L, ...).
-        traces (`list[ForesightTrace]`):
-            The L foresight traces.
+        trace (`ForesightTrace`):
+            What foresight saw at each of the L steps.
+        horizon (`int`):
+            Longest horizon T.
         mask (`Tensor`):
             Steps that exist, (B, L).
-        joint_dim (`int`):
-            How many of the D dimensions are joints.
 
     Returns:
         `Tensor`: binary cross-entropy between `sigmoid(step)` and the fraction of the horizon, scalar.
     """
-    fractions = []
-    for trace in traces:
-        rows = torch.arange(trace.chosen.shape[0], device=trace.chosen.device)
-        kept = trace.log_variances[:, trace.chosen, rows]  # (T, B, D)
-        best = uncertainty(kept, joint_dim, "variance").argmin(0) + 1  # (B,)
-        fractions.append(best / kept.shape[0])
-    target = torch.stack(fractions, dim=1)  # (B, L)
+    assert trace.calmest is not None
+    calmest = trace.calmest.gather(1, trace.chosen.unsqueeze(1)).squeeze(1)  # (L, B)
+    target = (calmest / horizon).T.to(prediction.step)  # (B, L)
     loss = nn.functional.binary_cross_entropy_with_logits(
         prediction.step, target[..., None].expand_as(prediction.step), reduction="none"
     )
     return loss.mean(-1)[mask].mean()
+
+
+def _model_class(kernel: str) -> type[UFRNN]:
+    if kernel == "reference":
+        return UFRNN
+    try:
+        from .kernels.unroll import FastUFRNN
+    except ImportError as error:
+        if kernel == "fast":
+            raise ImportError(
+                f"`kernel=fast` needs Numba, which cannot be imported here ({error}). Install it (`pip install numba`) "
+                "or take --policy.kernel=reference."
+            ) from error
+        logger.warning("Numba cannot be imported (%s): taking the reference kernel, about ten times slower.", error)
+        return UFRNN
+    return FastUFRNN

@@ -56,7 +56,7 @@ class UFRNN(nn.Module):
         state, trace = self.foresight(self.network, state, memory.prediction, generator)
         return Memory(state, self.network.predict(state)), trace
 
-    def forward(self, inputs: Tensor, generator: Generator | None = None) -> tuple[Prediction, list[ForesightTrace]]:
+    def forward(self, inputs: Tensor, generator: Generator | None = None) -> tuple[Prediction, ForesightTrace | None]:
         """Predicts every next step of whole episodes, reading the measured inputs (teacher forcing).
 
         Args:
@@ -66,8 +66,8 @@ class UFRNN(nn.Module):
                 Source of the exploration noise.
 
         Returns:
-            `tuple[Prediction, list[ForesightTrace]]`: predictions stacked over time, (B, L, ...) each, and the L
-                foresight traces (empty without foresight).
+            `tuple[Prediction, ForesightTrace | None]`: predictions stacked over time, (B, L, ...) each, and
+                what foresight saw at each of the L steps (`None` without foresight).
         """
         memory = self.initial_memory(inputs.shape[0])
         predictions, traces = [], []
@@ -76,7 +76,8 @@ class UFRNN(nn.Module):
             predictions.append(memory.prediction)
             if trace is not None:
                 traces.append(trace)
-        return Prediction(*(torch.stack(values, dim=1) for values in zip(*predictions, strict=True))), traces
+        prediction = Prediction(*(torch.stack(values, dim=1) for values in zip(*predictions, strict=True)))
+        return prediction, ForesightTrace.stack(traces) if traces else None
 
     def modality_variance(self, prediction: Prediction) -> Tensor:
         """Mean predicted variance of each modality, (..., 2), joints first."""

@@ -42,7 +42,7 @@ class TrialHistory:
         """`int`: where the imagined futures part most in the 2 s before the first try (before the end, without one)."""
         stop = (self.first_try if self.first_try is not None else len(self.traces) - 1) + 1
         start = max(0, stop - 20)
-        spreads = [trace.means[-1, :, 0].std(dim=0).mean().item() for trace in self.traces[start:stop]]
+        spreads = [trace.imagined.mean[-1, :, 0].std(dim=0).mean().item() for trace in self.traces[start:stop]]
         return start + int(np.argmax(spreads))
 
 
@@ -68,8 +68,8 @@ def draw(policy: UFRNNPolicy, history: TrialHistory, joint_names: tuple[str, ...
     joint_dim = policy.model.network.joint_dim
     chosen = int(trace.chosen[0])
     num_samples = trace.final.shape[0]
-    imagined = _decode(policy, trace.means[-1, :, 0, joint_dim:], camera)  # (N, height, width, 3)
-    image = torch.from_numpy(history.images[step]).permute(2, 0, 1)[None].to(trace.means.device)
+    imagined = _decode(policy, trace.imagined.mean[-1, :, 0, joint_dim:], camera)  # (N, height, width, 3)
+    image = torch.from_numpy(history.images[step]).permute(2, 0, 1)[None].to(trace.imagined.mean.device)
     with torch.no_grad():
         seen = policy.image_encoder(dict.fromkeys(policy.config.cameras, image))
     reconstruction = _decode(policy, seen, camera)[0]
@@ -102,9 +102,9 @@ def draw(policy: UFRNNPolicy, history: TrialHistory, joint_names: tuple[str, ...
 
 def _draw_paths(axes, policy, history, trace, step, joint_names) -> None:
     joint_dim = policy.model.network.joint_dim
-    imagined = policy.joint_scaler.unscale(trace.means[:, :, 0, :joint_dim]).cpu().numpy()  # (T, N, D_j)
+    imagined = policy.joint_scaler.unscale(trace.imagined.mean[:, :, 0, :joint_dim]).cpu().numpy()  # (T, N, D_j)
     # The joint whose imagined paths spread most, relative to its range.
-    joint = int(trace.means[-1, :, 0, :joint_dim].std(dim=0).argmax())
+    joint = int(trace.imagined.mean[-1, :, 0, :joint_dim].std(dim=0).argmax())
     start = max(0, step - 20)
     measured = np.array([joints[joint] for joints in history.joints[start:]])
     axes.plot(np.arange(start, start + len(measured)), measured, color="black", linewidth=1.5, label="what happened")

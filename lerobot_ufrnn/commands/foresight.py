@@ -73,6 +73,7 @@ def draw_trial(config: ForesightConfig) -> None:
             else f"ufrnn with exploration={policy_config.exploration}"
         )
         raise ValueError(f"There is foresight only in a ufrnn policy with exploration=foresight; this one is {kind}.")
+    policy_config.kernel = "reference"  # which keeps what it imagines
     policy = UFRNNPolicy.from_pretrained(config.policy_path, config=policy_config)
     env = gym.make(
         "env_door/Door-v0",

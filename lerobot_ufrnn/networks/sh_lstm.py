@@ -76,6 +76,13 @@ class SHLSTM(nn.Module):
         self.joint_head = nn.Linear(joint_hidden_dim, 2 * joint_dim + 1)
         self.image_head = nn.Linear(image_hidden_dim, 2 * feature_dim + 1)
 
+    @property
+    def state_sizes(self) -> tuple[int, ...]:
+        """`tuple[int, ...]`: hidden size of each field of `HiddenState`."""
+        return tuple(
+            cell.hidden_size for cell in (self.joint_cell, self.image_cell, self.shared_cell) for _ in ("h", "c")
+        )
+
     def initial_state(self, batch_size: int) -> HiddenState:
         """Zero state, the same for every sequence: a learned state per sequence would leak what is to be found out.
 

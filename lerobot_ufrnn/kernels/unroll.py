@@ -1,0 +1,302 @@
+"""UF-RNN with the compiled kernel: same signature, same numbers, a fraction of the time."""
+
+import logging
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+from torch.autograd.function import once_differentiable
+
+from ..foresight import Foresight, ForesightTrace
+from ..networks import SHLSTM, HiddenState, Prediction
+from ..recurrent import UFRNN, Memory
+from .matmul import PANEL
+from .packing import Cells, Heads, pack_cells, pack_heads, to_panels
+from .sequence import GateGradients, Options, Sizes, Steps, TransposedWeights, Weights, walk, walk_back
+
+logger = logging.getLogger(__name__)
+
+
+class _Packed(NamedTuple):
+    """Weights on the CPU: the cells' as tensors that know where they come from, and all as `walk` reads them."""
+
+    cells: Cells
+    weights: Weights
+
+
+class FastUFRNN(UFRNN):
+    """[`UFRNN`] with compiled code for the CPU.
+
+    Sequences are independent of each other and share PyTorch's number of threads; each comes out the same bit for bit,
+    whatever that number and the rest of the batch. With weights on another device, weights and inputs visit the CPU for
+    the recurrence: it is so small and so sequential that a GPU would spend its time on starting kernels.
+
+    Imagined futures are not kept: `ForesightTrace.futures` is `None`.
+
+    Args:
+        network (`SHLSTM`):
+            The stochastic hierarchical LSTM.
+        foresight (`Foresight`):
+            What happens to the hidden state at each step.
+    """
+
+    def __init__(self, network: SHLSTM, foresight: Foresight):
+        super().__init__(network, foresight)
+        self._sizes = Sizes(
+            network.joint_dim,
+            network.feature_dim,
+            network.joint_cell.hidden_size,
+            network.image_cell.hidden_size,
+            network.shared_cell.hidden_size,
+        )
+        self._options = _options(network, foresight)
+        self._packed: tuple[tuple[tuple[int, int], ...], _Packed] | None = None
+        # Compiled code is made or loaded now, so that a robot's first tick does not wait for it.
+        inputs = torch.zeros(1, network.joint_dim + network.feature_dim)
+        self.advance(inputs, self.initial_memory(1), torch.Generator().manual_seed(0))
+
+    def advance(
+        self, inputs: Tensor, memory: Memory, generator: Generator | None = None
+    ) -> tuple[Memory, ForesightTrace | None]:
+        """See [`UFRNN.advance`]; carries no gradient."""
+        with torch.no_grad(), torch.autocast(inputs.device.type, enabled=False):
+            prediction, state, trace = self._walk(inputs.unsqueeze(1), memory.state, generator, self._pack_once())
+        now = Prediction(*(values[:, 0] for values in prediction))
+        return Memory(state, now), None if trace is None else trace.at(0)
+
+    def forward(self, inputs: Tensor, generator: Generator | None = None) -> tuple[Prediction, ForesightTrace | None]:
+        """See [`UFRNN.forward`]."""
+        start = self.network.initial_state(inputs.shape[0])
+        with torch.autocast(inputs.device.type, enabled=False):
+            prediction, _, trace = self._walk(inputs, start, generator, self._pack())
+        return prediction, trace
+
+    def _walk(
+        self, inputs: Tensor, start: HiddenState, generator: Generator | None, packed: _Packed
+    ) -> tuple[Prediction, HiddenState, ForesightTrace | None]:
+        foresight, device = self.foresight, inputs.device
+        batch_size, length = inputs.shape[:2]
+        noise = torch.empty(batch_size, length, 1, 0)
+        if self._options.perturbs:
+            draws = [foresight.sample_noise(start, generator) for _ in range(length)]  # (N, B, S) each
+            noise = torch.stack(draws).permute(2, 0, 1, 3)  # (B, L, N, S)
+        hidden = torch.cat((start.h_joint, start.h_image, start.h_shared), dim=-1).unsqueeze(1)
+        cell = torch.cat((start.c_joint, start.c_image, start.c_shared), dim=-1).unsqueeze(1)
+        schedule = foresight.schedule
+        episode = _Episode(
+            self._sizes,
+            self._options,
+            packed.weights,
+            _host(torch.stack((schedule.low, schedule.high))).numpy(),
+            _host(noise).numpy(),
+            _host(hidden).numpy(),
+            _host(cell).numpy(),
+        )
+        kept = _Walk.apply(episode, _host(inputs), *packed.cells)
+        steps = episode.steps
+        parts = self._sizes[2:]
+        h_joint, h_image, h_shared = kept.to(device).split(parts, dim=-1)
+        c_joint, c_image, c_shared = torch.from_numpy(steps.cell).to(device).split(parts, dim=-1)
+        states = HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)  # (B, L, hidden size) each
+        prediction = self.network.predict(states)
+        last = HiddenState(*(values[:, -1] for values in states))
+        return prediction, last, self._trace(steps, device) if self._options.selects else None
+
+    def _trace(self, steps: Steps, device: torch.device) -> ForesightTrace:
+        def time_first(values: np.ndarray) -> Tensor:  # (B, L, ...) -> (L, ..., B)
+            return torch.from_numpy(values).to(device).movedim(0, -1)
+
+        return ForesightTrace(
+            time_first(steps.noise_std).transpose(1, 2),
+            time_first(steps.chosen),
+            time_first(steps.baseline),
+            time_first(steps.final),
+            time_first(steps.horizon),
+            time_first(steps.calmest) if self._options.learned_horizon else None,
+            None,
+        )
+
+    def _pack(self) -> _Packed:
+        cells = Cells(*map(_host, pack_cells(self.network)))
+        heads = Heads(*map(_host, pack_heads(self.network)))
+        return _Packed(cells, Weights(*(weight.detach().numpy() for weight in (*cells, *heads))))
+
+    def _pack_once(self) -> _Packed:
+        """Packed weights, made anew only when a parameter was changed in place or replaced."""
+        versions = tuple(
+            (parameter.data_ptr(), parameter._version)
+            for layer in self.network.children()
+            for parameter in layer.parameters(recurse=False)
+        )
+        if self._packed is None or self._packed[0] != versions:
+            self._packed = versions, self._pack()
+        return self._packed[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_packed": None}
+
+
+def _host(values: Tensor) -> Tensor:
+    """What compiled code reads: contiguous on the CPU, float64 as it is and anything narrower as float32."""
+    number = torch.float64 if values.dtype == torch.float64 else torch.float32
+    return values.to("cpu", number).contiguous()
+
+
+def _options(network: SHLSTM, foresight: Foresight) -> Options:
+    low, high = network.log_variance_range
+    schedule = foresight.schedule
+    columns, column = [], 0
+    for name, size in zip(HiddenState._fields, network.state_sizes, strict=True):
+        columns.append(column if name in foresight.perturbed else -1)
+        column += size if name in foresight.perturbed else 0
+    return Options(
+        float(low),
+        float(high),
+        foresight.exploration != "none",
+        foresight.exploration == "foresight",
+        foresight.horizon,
+        foresight.learned_horizon,
+        foresight.baseline == "candidate",
+        foresight.aggregation == "entropy",
+        float(schedule.noise_range[0]),
+        float(schedule.noise_range[1]),
+        schedule.noise_unit == "variance",
+        schedule.log_scale,
+        tuple(columns),  # type: ignore[arg-type]
+    )
+
+
+class _Episode:
+    """A batch of episodes on their way through `walk` and `walk_back`."""
+
+    def __init__(
+        self,
+        sizes: Sizes,
+        options: Options,
+        weights: Weights,
+        noise_bounds: np.ndarray,
+        noise: np.ndarray,
+        hidden: np.ndarray,
+        cell: np.ndarray,
+    ):
+        self.sizes, self.options, self.weights = sizes, options, weights
+        self.noise_bounds, self.noise = noise_bounds, noise
+        self.first_hidden, self.first_cell = hidden, cell
+        batch_size, length, num_samples = noise.shape[:3]
+        number, hidden_size = hidden.dtype, hidden.shape[-1]
+
+        def empty(*shape: int, dtype: Any = number) -> np.ndarray:
+            return np.empty((batch_size, length, *shape), dtype)
+
+        self.steps = Steps(
+            empty(hidden_size),
+            empty(hidden_size),
+            empty(hidden_size),
+            empty(sizes.joint_dim + sizes.shared_hidden),
+            empty(sizes.feature_dim + sizes.shared_hidden),
+            empty(len(weights.shared_bias)),
+            empty(len(weights.joint_bias)),
+            empty(len(weights.image_bias)),
+            empty(2),
+            empty(dtype=np.int64),
+            empty(num_samples),
+            empty(num_samples),
+            empty(num_samples, dtype=np.int64),
+            empty(num_samples, dtype=np.int64),
+        )
+
+    def walk(self, inputs: np.ndarray) -> None:
+        hidden, cell = self.first_hidden.copy(), self.first_cell.copy()
+
+        def one(row: int) -> None:
+            walk(
+                self.weights,
+                self.sizes,
+                self.options,
+                self.noise_bounds,
+                inputs[row],
+                self.noise[row],
+                hidden[row],
+                cell[row],
+                Steps(*(values[row] for values in self.steps)),
+            )
+
+        _for_each(one, len(inputs))
+
+    def walk_back(self, grad_kept: np.ndarray) -> GateGradients:
+        weights, sizes, steps = self.weights, self.sizes, self.steps
+        joint, image, shared = (_columns(panels) for panels in (weights.joint, weights.image, weights.shared))
+        transposed = TransposedWeights(
+            to_panels(shared.T).numpy(),
+            to_panels(joint[sizes.joint_dim :].T).numpy(),
+            to_panels(image[sizes.feature_dim :].T).numpy(),
+            np.zeros(len(shared) + PANEL, weights.shared.dtype),
+        )
+        gradients = GateGradients(
+            *(np.zeros_like(gates) for gates in (steps.shared_gates, steps.joint_gates, steps.image_gates))
+        )
+
+        def one(row: int) -> None:
+            walk_back(
+                transposed,
+                sizes,
+                Steps(*(values[row] for values in steps)),
+                self.first_cell[row, 0],
+                grad_kept[row],
+                GateGradients(*(values[row] for values in gradients)),
+            )
+
+        _for_each(one, len(grad_kept))
+        return gradients
+
+
+class _Walk(torch.autograd.Function):
+    """Kept hidden states (B, L, H) of a batch of episodes; exact gradients of the inputs and of the cells' weights."""
+
+    @staticmethod
+    def forward(ctx: Any, episode: _Episode, inputs: Tensor, *cells: Tensor) -> Tensor:
+        episode.walk(inputs.detach().numpy())
+        ctx.episode = episode
+        return torch.from_numpy(episode.steps.hidden)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_kept: Tensor) -> tuple[Tensor | None, ...]:
+        episode: _Episode = ctx.episode
+        sizes, weights, steps = episode.sizes, episode.weights, episode.steps
+        gates = [torch.from_numpy(values) for values in episode.walk_back(grad_kept.contiguous().numpy())]
+        before = np.concatenate((episode.first_hidden, steps.hidden[:, :-1]), axis=1)
+        cells: list[Tensor] = []
+        for values, gradient in zip((before, steps.joint_input, steps.image_input), gates, strict=True):
+            weight = torch.from_numpy(values).flatten(0, 1).T @ gradient.flatten(0, 1)
+            cells += [to_panels(weight), gradient.sum((0, 1))]
+        inputs = None
+        if ctx.needs_input_grad[1]:
+            joints = gates[1] @ _columns(weights.joint)[: sizes.joint_dim].T
+            features = gates[2] @ _columns(weights.image)[: sizes.feature_dim].T
+            inputs = torch.cat((joints, features), dim=-1)
+        return None, inputs, *cells
+
+
+def _columns(panels: np.ndarray) -> Tensor:
+    """Panels (P, K, `PANEL`) -> matrix (K, P * `PANEL`)."""
+    return torch.from_numpy(panels).transpose(0, 1).flatten(1)
+
+
+@cache
+def _pool(num_threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num_threads, thread_name_prefix="ufrnn")
+
+
+def _for_each(function: Callable[[int], None], count: int) -> None:
+    """Calls `function` for each row, on as many threads as PyTorch uses."""
+    num_threads = min(torch.get_num_threads(), count)
+    calls: Iterable[None] = map(function, range(count))
+    if num_threads > 1:
+        calls = _pool(num_threads).map(function, range(count))
+    for _ in calls:
+        pass

@@ -1,0 +1,257 @@
+"""The compiled kernel against the readable code, and its parts against NumPy."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lerobot.policies.factory import make_policy
+from small import batch_of, small_config, train
+
+from lerobot_ufrnn.foresight import PERTURBED_STATES, Foresight, NoiseSchedule
+from lerobot_ufrnn.kernels.activations import tanh_all
+from lerobot_ufrnn.kernels.matmul import PANEL, multiply_add
+from lerobot_ufrnn.kernels.packing import to_panels
+from lerobot_ufrnn.kernels.unroll import FastUFRNN
+from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
+from lerobot_ufrnn.networks import SHLSTM, gaussian_nll
+from lerobot_ufrnn.recurrent import UFRNN
+
+sizes = st.integers(1, 20)
+
+
+def make_pair(dims, seed, dtype=torch.float64, gain=2.0, schedule=None, **foresight) -> tuple[UFRNN, FastUFRNN]:
+    """The same model twice: readable and compiled."""
+    torch.manual_seed(seed)
+    network = SHLSTM(*dims, (-9.0, 3.0))
+    for parameter in network.parameters():  # larger weights than at the start, so that candidates part
+        parameter.data.mul_(gain)
+    noise = NoiseSchedule(**{"noise_range": (0.05, 0.15), "noise_unit": "std", "log_scale": False, **(schedule or {})})
+    bounds = torch.tensor([[0.1, 0.2], [2.0, 3.0]])
+    bounds = bounds.log() if noise.log_scale else bounds
+    noise.low.copy_(bounds[0])
+    noise.high.copy_(bounds[1])
+    explorer = Foresight(**{"exploration": "foresight", "num_samples": 5, "horizon": 3, **foresight}, schedule=noise)
+    return UFRNN(network, explorer).to(dtype), FastUFRNN(network, explorer).to(dtype)
+
+
+def run(model, inputs, seed):
+    """Predictions, trace, loss and gradients of inputs and parameters."""
+    model.zero_grad()
+    leaf = inputs.clone().requires_grad_()
+    prediction, trace = model(leaf, torch.Generator().manual_seed(seed))
+    target = inputs.roll(-1, dims=1)
+    loss = gaussian_nll(target, prediction.mean, prediction.log_variance).mean() + prediction.step.square().mean()
+    loss.backward()
+    gradients = {name: value.grad.clone() for name, value in model.named_parameters()}
+    return prediction, trace, loss.detach(), {**gradients, "inputs": leaf.grad}
+
+
+def named(name):
+    return lambda text: f"{name}: {text}"
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    dims=st.tuples(sizes, sizes, sizes, sizes, sizes),
+    batch_size=st.integers(1, 4),
+    length=st.integers(1, 12),
+    num_samples=st.integers(1, 12),
+    horizon=st.integers(1, 6),
+    exploration=st.sampled_from(["foresight", "foresight", "noise", "none"]),
+    perturbed_states=st.sampled_from(sorted(PERTURBED_STATES)),
+    baseline=st.sampled_from(["common", "candidate"]),
+    aggregation=st.sampled_from(["variance", "entropy"]),
+    learned_horizon=st.booleans(),
+    keep_unperturbed=st.booleans(),
+    noise_unit=st.sampled_from(["variance", "std"]),
+    log_scale=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_forward_loss_gradients_and_choices_equal_the_reference(
+    dims, batch_size, length, noise_unit, log_scale, seed, **foresight
+):
+    schedule = {"noise_unit": noise_unit, "log_scale": log_scale}
+    reference, fast = make_pair(dims, seed, schedule=schedule, **foresight)
+    inputs = torch.rand(batch_size, length, dims[0] + dims[1], dtype=torch.float64) * 1.6 - 0.8
+    theirs, ours = run(reference, inputs, seed), run(fast, inputs, seed)
+    for name, expected, value in zip(theirs[0]._fields, theirs[0], ours[0], strict=True):
+        torch.testing.assert_close(
+            value, expected, rtol=1e-9, atol=1e-12, msg=lambda text, name=name: f"{name}: {text}"
+        )
+    torch.testing.assert_close(ours[2], theirs[2], rtol=1e-9, atol=0)
+    for name, expected in theirs[3].items():
+        torch.testing.assert_close(ours[3][name], expected, rtol=1e-7, atol=1e-12, msg=named(name))
+    if theirs[1] is None:
+        assert ours[1] is None
+        return
+    for name in ("chosen", "horizon", "calmest"):
+        expected = getattr(theirs[1], name)
+        assert expected is getattr(ours[1], name) is None or torch.equal(getattr(ours[1], name), expected), name
+    for name in ("noise_std", "baseline", "final"):
+        torch.testing.assert_close(getattr(ours[1], name), getattr(theirs[1], name), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("exploration", ["noise", "none"])
+def test_float32_agrees_to_its_precision_over_a_whole_episode(exploration):
+    """Without selection, which may turn on the last bit, 150 steps stay together."""
+    reference, fast = make_pair((7, 10, 50, 50, 20), 0, torch.float32, gain=1, exploration=exploration)
+    inputs = torch.rand(2, 150, 17) * 1.6 - 0.8
+    theirs, ours = run(reference, inputs, 0), run(fast, inputs, 0)
+    torch.testing.assert_close(ours[0].mean, theirs[0].mean, rtol=0, atol=1e-5)
+    torch.testing.assert_close(ours[0].log_variance, theirs[0].log_variance, rtol=0, atol=1e-5)
+    for name, expected in theirs[3].items():
+        assert (ours[3][name] - expected).norm() <= 1e-4 * expected.norm() + 1e-7, name
+
+
+def test_float32_makes_the_choices_of_float64_wherever_they_are_not_a_tie():
+    """One step from the same state at a time, so that one tie does not change all that follows."""
+    single, double = (make_pair((7, 10, 50, 50, 20), 0, dtype)[1] for dtype in (torch.float32, torch.float64))
+    memory, agreed, clear = double.initial_memory(20), 0, 0
+    for _ in range(30):
+        inputs = torch.rand(20, 17, dtype=torch.float64) * 1.6 - 0.8
+        noise = torch.randn(5, 20, 120, dtype=torch.float64)
+        traces = []
+        for model in (single, double):
+            number = next(model.parameters()).dtype
+            model.foresight.sample_noise = lambda *_, number=number, noise=noise: noise.to(number)
+            start = type(memory)(*(type(part)(*(value.to(number) for value in part)) for part in memory))
+            after, trace = model.advance(inputs.to(number), start)
+            traces.append(trace)
+        memory = after
+        best = (traces[1].baseline - traces[1].final).topk(2, dim=0).values
+        is_clear = best[0] - best[1] > 1e-4
+        agreed += int((traces[0].chosen == traces[1].chosen)[is_clear].sum())
+        clear += int(is_clear.sum())
+    assert clear > 300
+    assert agreed == clear
+
+
+def test_an_episode_is_the_same_step_by_step():
+    _, fast = make_pair((3, 4, 6, 5, 4), 0)
+    inputs = torch.rand(2, 6, 7, dtype=torch.float64)
+    whole, traces = fast(inputs, torch.Generator().manual_seed(5))
+    generator, memory = torch.Generator().manual_seed(5), fast.initial_memory(2)
+    for step in range(6):
+        memory, trace = fast.advance(inputs[:, step], memory, generator)
+        torch.testing.assert_close(memory.prediction.mean, whole.mean[:, step])
+        assert torch.equal(trace.chosen, traces.chosen[step])
+
+
+def test_a_sequence_does_not_depend_on_threads_or_on_its_batch():
+    _, fast = make_pair((7, 10, 50, 50, 20), 0, torch.float32)
+    inputs, noise = torch.rand(20, 3, 17), torch.randn(20, 5, 3, 120)
+
+    def last_state(rows, num_threads):
+        draws = iter(noise[:, :, rows])
+        fast.foresight.sample_noise = lambda *_: next(draws)
+        before = torch.get_num_threads()
+        torch.set_num_threads(num_threads)
+        try:
+            memory = fast.initial_memory(len(rows))
+            for step_inputs in inputs[:, rows]:
+                memory, _ = fast.advance(step_inputs, memory)
+        finally:
+            torch.set_num_threads(before)
+        return torch.cat(memory.state, dim=-1)
+
+    together = last_state([0, 1, 2], 1)
+    assert torch.equal(last_state([0, 1, 2], 3), together)
+    assert torch.equal(last_state([1], 1), together[1:2])
+
+
+def test_changed_weights_are_used_at_the_next_step():
+    reference, fast = make_pair((3, 4, 6, 5, 4), 0, exploration="none")
+    inputs = torch.rand(1, 7, dtype=torch.float64)
+    for _ in range(3):
+        fast.advance(inputs, fast.initial_memory(1))
+        with torch.no_grad():
+            for parameter in fast.network.parameters():
+                parameter.mul_(1.1)
+        ours, _ = fast.advance(inputs, fast.initial_memory(1))
+        theirs, _ = reference.advance(inputs, reference.initial_memory(1))
+        torch.testing.assert_close(ours.prediction.mean, theirs.prediction.mean)
+
+
+def test_broken_weights_are_not_hidden():
+    _, fast = make_pair((3, 4, 6, 5, 4), 0, torch.float32)
+    with torch.no_grad():
+        fast.network.shared_cell.weight_ih[0, 0] = float("nan")
+    memory, _ = fast.advance(torch.rand(1, 7), fast.advance(torch.rand(1, 7), fast.initial_memory(1))[0])
+    assert not torch.isfinite(memory.prediction.mean).all()
+
+
+def test_autocast_does_not_reach_the_kernel():
+    _, fast = make_pair((3, 4, 6, 5, 4), 0, torch.float32, exploration="none")
+    inputs = torch.rand(2, 5, 7)
+    expected = fast(inputs)[0].mean
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(fast(inputs)[0].mean, expected)
+
+
+@given(rows=st.integers(1, 13), depth=st.integers(1, 30), panels=st.integers(1, 6), seed=st.integers(0, 100))
+@settings(max_examples=60, deadline=None)
+def test_multiply_add_equals_numpy(rows, depth, panels, seed):
+    rng = np.random.default_rng(seed)
+    for number, tolerance in ((np.float32, 1e-4), (np.float64, 1e-12)):
+        x, weight, bias = (
+            rng.standard_normal(shape).astype(number)
+            for shape in ((rows, depth), (depth, panels * PANEL), (panels * PANEL,))
+        )
+        out = np.full((rows + 1, panels * PANEL), 7, number)
+        multiply_add(x, to_panels(torch.from_numpy(weight)).numpy(), bias, out[:rows])
+        np.testing.assert_allclose(out[:rows], x @ weight + bias, rtol=0, atol=tolerance)
+        assert (out[rows] == 7).all()
+
+
+@pytest.mark.parametrize(("number", "tolerance"), [(np.float32, 4e-7), (np.float64, 1e-15)])
+def test_tanh_is_accurate_everywhere(number, tolerance):
+    x = np.concatenate([np.linspace(-12, 12, 200001), np.logspace(-30, 2, 1000), [0.0]]).astype(number)
+    expected = np.tanh(x.astype(np.longdouble))
+    squashed = x[None].copy()
+    tanh_all(squashed)
+    assert (np.abs(squashed[0] - expected) <= tolerance * np.abs(expected)).all()
+
+
+@pytest.mark.parametrize("number", [np.float32, np.float64])
+def test_tanh_keeps_nan_and_bounds_infinity(number):
+    values = np.array([[np.nan, np.inf, -np.inf] * 9], number)
+    tanh_all(values)
+    assert np.isnan(values[0, ::3]).all()
+    np.testing.assert_allclose(values[0, 1::3], 1, rtol=1e-6)
+    np.testing.assert_allclose(values[0, 2::3], -1, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("kernel", "expected"), [("auto", FastUFRNN), ("fast", FastUFRNN), ("reference", UFRNN)])
+def test_the_configuration_chooses_the_kernel(dataset, kernel, expected):
+    assert type(make_policy(small_config(kernel=kernel), ds_meta=dataset.meta).model) is expected
+
+
+def test_without_numba_the_reference_steps_in_and_fast_says_what_is_missing():
+    code = (
+        "import sys; sys.modules['numba'] = None\n"
+        "from lerobot_ufrnn.modeling_ufrnn import _model_class\n"
+        "print(_model_class('auto').__name__)\n"
+        "try: _model_class('fast')\n"
+        "except ImportError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("UFRNN\n")
+    assert "pip install numba" in done.stdout
+    assert "reference kernel" in done.stderr
+
+
+def test_training_gives_the_same_weights_with_both_kernels(dataset):
+    """Through the policy: both phases, all losses, three updates."""
+    weights = []
+    for kernel in ("fast", "reference"):
+        torch.manual_seed(0)
+        policy = make_policy(small_config(kernel=kernel, exploration="noise"), ds_meta=dataset.meta)
+        assert isinstance(policy, UFRNNPolicy)
+        train(policy, [batch_of(0, 1, 2)] * 5)
+        weights.append({name: value.clone() for name, value in policy.state_dict().items()})
+    for name, expected in weights[1].items():
+        torch.testing.assert_close(weights[0][name], expected, rtol=1e-3, atol=1e-4)
