@@ -75,15 +75,18 @@ class UFRNNConfig(PreTrainedConfig):
             Height and width in pixels that camera images are resized to.
         feature_dim (`int`, *optional*, defaults to `10`):
             Image features per camera.
-        conv_channels (`tuple[int, ...]`, *optional*, defaults to `(32, 32, 16, 12, 8)`):
-            Channels of the autoencoder's convolutions; each halves height and width.
-        autoencoder_hidden_dim (`int`, *optional*, defaults to `50`):
+        conv_channels (`tuple[int, ...]`, *optional*, defaults to `(64, 64)`):
+            Channels of the autoencoder's convolutions; all but the first halve height and width.
+        conv_first_stride (`int`, *optional*, defaults to `16`):
+            By how much the first convolution divides height and width. Patches of 16 pixels learn in a tenth of the
+            time of the usual 2 (as in `configs/ufrnn_paper.yaml`), at a lower error.
+        autoencoder_hidden_dim (`int`, *optional*, defaults to `128`):
             Width of the linear layer around the bottleneck.
-        autoencoder_steps (`int`, *optional*, defaults to `800`):
+        autoencoder_steps (`int`, *optional*, defaults to `400`):
             Training updates spent on the autoencoder before the recurrent network starts.
-        autoencoder_batch_size (`int`, *optional*, defaults to `32`):
+        autoencoder_batch_size (`int`, *optional*, defaults to `16`):
             Frames per autoencoder update, drawn from the batch's episodes.
-        autoencoder_lr (`float`, *optional*, defaults to `2e-3`):
+        autoencoder_lr (`float`, *optional*, defaults to `3e-3`):
             Adam learning rate of the autoencoder.
         autoencoder_path (`str`, *optional*):
             Checkpoint folder or Hub repository of a `ufrnn` policy whose trained autoencoder is taken over; no update
@@ -138,11 +141,12 @@ class UFRNNConfig(PreTrainedConfig):
 
     image_size: tuple[int, int] = (128, 128)
     feature_dim: int = 10
-    conv_channels: tuple[int, ...] = (32, 32, 16, 12, 8)
-    autoencoder_hidden_dim: int = 50
-    autoencoder_steps: int = 800
-    autoencoder_batch_size: int = 32
-    autoencoder_lr: float = 2e-3
+    conv_channels: tuple[int, ...] = (64, 64)
+    conv_first_stride: int = 16
+    autoencoder_hidden_dim: int = 128
+    autoencoder_steps: int = 400
+    autoencoder_batch_size: int = 16
+    autoencoder_lr: float = 3e-3
     autoencoder_path: str | None = None
     image_shift: int = 2
     image_jitter: float = 0.1
@@ -174,6 +178,7 @@ class UFRNNConfig(PreTrainedConfig):
         for name in (
             *("num_samples", "horizon", "joint_hidden_dim", "image_hidden_dim", "shared_hidden_dim"),
             *("feature_dim", "autoencoder_hidden_dim", "autoencoder_batch_size", "autoencoder_steps", "stall_steps"),
+            "conv_first_stride",
         ):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         for name in ("image_shift", "drop_n_last_frames"):
@@ -190,12 +195,14 @@ class UFRNNConfig(PreTrainedConfig):
         self._require("log_variance_range", -math.inf < low < high < math.inf, "two finite numbers with low < high")
         height, width = self._pair("image_size")
         self._require("image_size", min(height, width) >= 16, "at least 16 x 16 pixels")
+        self._require("conv_first_stride", self.conv_first_stride <= min(height, width), "at most the image's side")
+        halvings = len(self.conv_channels) - 1
         self._require(
             "conv_channels",
-            len(self.conv_channels) >= 1
+            halvings >= 0
             and min(self.conv_channels) >= 1
-            and 2 ** len(self.conv_channels) <= min(height, width),
-            "positive, and no more of them than the image can be halved",
+            and self.conv_first_stride * 2**halvings <= min(height, width),
+            "positive, and no more of them than the image can be halved after `conv_first_stride`",
         )
 
     def _pair(self, name: str) -> tuple[float, float]:

@@ -72,6 +72,7 @@ class UFRNNPolicy(PreTrainedPolicy):
             config.feature_dim,
             config.conv_channels,
             config.autoencoder_hidden_dim,
+            config.conv_first_stride,
         )
         self.joint_scaler = RangeScaler(joint_dim)
         self.model = _model_class(config.kernel)(

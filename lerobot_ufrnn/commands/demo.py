@@ -37,7 +37,7 @@ class DemoConfig:
             Demonstrations for each of the three kinds of door.
         exploration (`str`, *optional*, defaults to `"foresight"`):
             `foresight` (UF-RNN), `noise` or `none` (its baselines).
-        autoencoder_steps (`int`, *optional*, defaults to `800`):
+        autoencoder_steps (`int`, *optional*, defaults to `400`):
             Updates of the autoencoder.
         recurrent_steps (`int`, *optional*, defaults to `600`):
             Updates of the recurrent network after that; 3 updates are an epoch of 15 demonstrations. Longer training
@@ -59,7 +59,7 @@ class DemoConfig:
     output_dir: Path = Path("outputs/demo")
     episodes_per_kind: int = 5
     exploration: str = "foresight"
-    autoencoder_steps: int = 800
+    autoencoder_steps: int = 400
     recurrent_steps: int = 600
     batch_size: int = 5
     save_freq: int = 200

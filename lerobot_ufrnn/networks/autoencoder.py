@@ -13,9 +13,11 @@ from .scaling import RangeScaler
 class ConvAutoencoder(nn.Module):
     """Compresses one camera's image to `feature_dim` numbers in (-1, 1) and back.
 
-    Stride-2 3x3 convolutions, a hidden linear layer and a tanh bottleneck, mirrored by the decoder (the layout of the
-    public deep-predictive-learning code of the paper's group). Only the difference from a fixed background image goes
-    through the network: a decoder this narrow otherwise spends its first hundreds of updates on drawing the room.
+    Strided convolutions, a hidden linear layer and a tanh bottleneck, mirrored by the decoder. With `first_stride=2`
+    this is the layout of the public deep-predictive-learning code of the paper's group. A large first stride makes one
+    point of each patch of the image: convolving single pixels takes nearly all of the time and slows down learning.
+    Only the difference from a fixed background image goes through the network: a decoder this narrow otherwise spends
+    its first hundreds of updates on drawing the room.
 
     Args:
         image_size (`tuple[int, int]`):
@@ -23,27 +25,40 @@ class ConvAutoencoder(nn.Module):
         feature_dim (`int`):
             Size of the bottleneck.
         channels (`Sequence[int]`):
-            Output channels of each convolution; each halves height and width.
+            Output channels of each convolution; all but the first halve height and width.
         hidden_dim (`int`):
             Width of the linear layer between convolutions and bottleneck.
+        first_stride (`int`, *optional*, defaults to `16`):
+            By how much the first convolution divides height and width.
     """
 
     background: Tensor
 
-    def __init__(self, image_size: tuple[int, int], feature_dim: int, channels: Sequence[int], hidden_dim: int):
+    def __init__(
+        self,
+        image_size: tuple[int, int],
+        feature_dim: int,
+        channels: Sequence[int],
+        hidden_dim: int,
+        first_stride: int = 16,
+    ):
         super().__init__()
         self.register_buffer("background", torch.zeros(3, *image_size))
-        sizes = [image_size]
-        for _ in channels:
+        sizes = [(math.ceil(image_size[0] / first_stride), math.ceil(image_size[1] / first_stride))]
+        # What sticks out of the image is filled up with background (left, right, top, bottom) and cut off again.
+        self.padding = (0, sizes[0][1] * first_stride - image_size[1], 0, sizes[0][0] * first_stride - image_size[0])
+        for _ in channels[1:]:
             height, width = sizes[-1]
             sizes.append(((height + 1) // 2, (width + 1) // 2))
-        widths = [3, *channels]
-        flat_dim = widths[-1] * sizes[-1][0] * sizes[-1][1]
+        flat_dim = channels[-1] * sizes[-1][0] * sizes[-1][1]
 
-        encoder: list[nn.Module] = []
-        for inside, outside in pairwise(widths):
+        kernel = max(first_stride, 3)
+        first = nn.Conv2d(3, channels[0], kernel, stride=first_stride, padding=(kernel - first_stride + 1) // 2)
+        encoder: list[nn.Module] = [first, nn.ReLU()]
+        for inside, outside in pairwise(channels):
             encoder += [nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.ReLU()]
-        encoder += [nn.Flatten(), nn.Linear(flat_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, feature_dim)]
+        bottleneck = nn.Linear(hidden_dim, feature_dim)
+        encoder += [nn.Flatten(), nn.Linear(flat_dim, hidden_dim), nn.ReLU(), bottleneck]
         self.encoder = nn.Sequential(*encoder, nn.Tanh())
 
         self.expander = nn.Sequential(
@@ -51,22 +66,30 @@ class ConvAutoencoder(nn.Module):
             nn.ReLU(),
             nn.Linear(hidden_dim, flat_dim),
             nn.ReLU(),
-            nn.Unflatten(1, (widths[-1], *sizes[-1])),
+            nn.Unflatten(1, (channels[-1], *sizes[-1])),
         )
         decoder: list[nn.Module] = []
-        for level in range(len(channels), 0, -1):
+        for level in range(len(channels) - 1, 0, -1):
             # An odd side was rounded up on the way down; output_padding restores exactly the size it had.
             (height, width), (full_height, full_width) = sizes[level], sizes[level - 1]
             padding = (full_height - (2 * height - 1), full_width - (2 * width - 1))
-            decoder.append(
-                nn.ConvTranspose2d(widths[level], widths[level - 1], 3, stride=2, padding=1, output_padding=padding)
-            )
-            if level > 1:
-                decoder.append(nn.ReLU())
+            inside, outside = channels[level], channels[level - 1]
+            decoder.append(nn.ConvTranspose2d(inside, outside, 3, stride=2, padding=1, output_padding=padding))
+            decoder.append(nn.ReLU())
+        last: nn.Module
+        if first_stride == 2:
+            last = nn.ConvTranspose2d(channels[0], 3, 3, stride=2, padding=1, output_padding=1)
+            decoder.append(last)
+        else:
+            # Where patches do not overlap this equals a transposed convolution, at a third of its time on a CPU.
+            last = nn.Conv2d(channels[0], 3 * first_stride**2, 1)
+            decoder += [last, nn.PixelShuffle(first_stride)]
         self.decoder = nn.Sequential(*decoder)
         self.apply(_keep_variance)
-        for parameter in decoder[-1].parameters():  # so that the first reconstruction is the background itself
+        for parameter in last.parameters():  # so that the first reconstruction is the background itself
             nn.init.zeros_(parameter)
+        # A feature that starts in the flat ends of tanh tends to stay there and tells little.
+        nn.init.normal_(bottleneck.weight, std=0.25 * math.sqrt(2 / hidden_dim))
 
     @torch.no_grad()
     def fit_background(self, images: Tensor) -> None:
@@ -75,12 +98,15 @@ class ConvAutoencoder(nn.Module):
 
     def encode(self, images: Tensor) -> Tensor:
         """Features (B, feature_dim) of `images` (B, 3, height, width) in [0, 1]."""
-        # Channels-last images make the convolutions about twice as fast on a CPU.
-        return self.encoder((images - self.background).contiguous(memory_format=torch.channels_last))
+        difference = images - self.background
+        if any(self.padding):
+            difference = nn.functional.pad(difference, self.padding)
+        return self.encoder(difference)
 
     def decode(self, features: Tensor) -> Tensor:
         """Images (B, 3, height, width), about in [0, 1], of `features` (B, feature_dim)."""
-        return self.decoder(self.expander(features).contiguous(memory_format=torch.channels_last)) + self.background
+        _, height, width = self.background.shape
+        return self.decoder(self.expander(features))[..., :height, :width] + self.background
 
 
 def _keep_variance(layer: nn.Module) -> None:
@@ -108,6 +134,8 @@ class ImageEncoder(nn.Module):
             See [`ConvAutoencoder`].
         hidden_dim (`int`):
             See [`ConvAutoencoder`].
+        first_stride (`int`, *optional*, defaults to `16`):
+            See [`ConvAutoencoder`].
     """
 
     def __init__(
@@ -117,13 +145,14 @@ class ImageEncoder(nn.Module):
         feature_dim: int,
         channels: Sequence[int],
         hidden_dim: int,
+        first_stride: int = 16,
     ):
         super().__init__()
         self.cameras = tuple(cameras)
         self.image_size = tuple(image_size)
         self.feature_dim = feature_dim
         self.autoencoders = nn.ModuleList(
-            ConvAutoencoder(image_size, feature_dim, channels, hidden_dim) for _ in self.cameras
+            ConvAutoencoder(image_size, feature_dim, channels, hidden_dim, first_stride) for _ in self.cameras
         )
         self.scaler = RangeScaler(feature_dim * len(self.cameras))
 

@@ -13,7 +13,11 @@ IMAGE_SIZE = 32
 
 
 def make_dataset(
-    root: Path, lengths: tuple[int, ...], cameras: tuple[str, ...] = ("front",), broken: dict | None = None
+    root: Path,
+    lengths: tuple[int, ...],
+    cameras: tuple[str, ...] = ("front",),
+    broken: dict | None = None,
+    use_videos: bool = False,
 ) -> LeRobotDataset:
     """A data set of smooth random motions; the image shows the first joint as a bright column.
 
@@ -26,11 +30,11 @@ def make_dataset(
     }
     for camera in cameras:
         features[f"observation.images.{camera}"] = {
-            "dtype": "image",
+            "dtype": "video" if use_videos else "image",
             "shape": (IMAGE_SIZE, IMAGE_SIZE, 3),
             "names": ["height", "width", "channels"],
         }
-    dataset = LeRobotDataset.create("test/motions", fps=10, features=features, root=root, use_videos=False)
+    dataset = LeRobotDataset.create("test/motions", fps=10, features=features, root=root, use_videos=use_videos)
     rng = np.random.default_rng(0)
     for index, length in enumerate(lengths):
         phase = rng.uniform(0, 2 * np.pi, len(names))
@@ -50,7 +54,7 @@ def make_dataset(
             dataset.add_frame(frame)
         dataset.save_episode()
     dataset.finalize()
-    return LeRobotDataset("test/motions", root=root)
+    return LeRobotDataset("test/motions", root=root, video_backend="pyav")
 
 
 def small_config(**overrides) -> UFRNNConfig:
@@ -65,6 +69,7 @@ def small_config(**overrides) -> UFRNNConfig:
         "image_size": (IMAGE_SIZE, IMAGE_SIZE),
         "feature_dim": 4,
         "conv_channels": (4, 4),
+        "conv_first_stride": 4,
         "autoencoder_hidden_dim": 8,
         "autoencoder_steps": 2,
         "autoencoder_batch_size": 4,

@@ -71,6 +71,8 @@ def test_a_saved_configuration_loads_equal(tmp_path):
         ("image_size", (8, 128), "at least 16 x 16"),
         ("conv_channels", (8,) * 9, "halved"),
         ("conv_channels", (), "halved"),
+        ("conv_first_stride", 0, "at least 1"),
+        ("conv_first_stride", 200, "side"),
     ],
 )
 def test_a_value_out_of_range_is_refused_with_what_is_allowed(field, value, allowed):
