@@ -48,19 +48,25 @@ class EpisodeStore:
 
     Args:
         meta (`LeRobotDatasetMetadata`):
-            Metadata of the dataset.
+            Metadata of the dataset; `encode` strikes the videos from it.
         cameras (`tuple[str, ...]`):
             Camera keys to load.
         encoder (`ImageEncoder`):
             Encodes the frames; also says to what size they are kept.
 
     Raises:
-        ValueError: If the dataset has no episode.
+        ValueError: If the dataset has no episode, or lacks joints or a camera.
     """
 
     def __init__(self, meta: "LeRobotDatasetMetadata", cameras: tuple[str, ...], encoder: ImageEncoder):
         if meta.total_episodes == 0:
             raise ValueError(f"Dataset '{meta.repo_id}' has no episodes; record some before training.")
+        missing = [key for key in (OBS_STATE, ACTION, *cameras) if key not in meta.features]
+        if missing:
+            raise ValueError(
+                f"Dataset '{meta.repo_id}' lacks {missing}; it has {sorted(meta.features)}. UF-RNN needs the joint "
+                "state, the action and every camera that the policy was built with."
+            )
         self._meta = meta
         self._cameras = cameras
         self._encoder = encoder
@@ -98,8 +104,15 @@ class EpisodeStore:
 
     @torch.no_grad()
     def encode(self) -> None:
-        """Replaces all frames by features; episodes named later are encoded as they come."""
+        """Replaces all frames by features; episodes named later are encoded as they come.
+
+        From now on LeRobot's loader need not decode a frame for each item either, which would take half as long as the
+        update itself: the videos are struck from the metadata that this store was given, and so from the items of the
+        dataset that it belongs to.
+        """
         self._encoded = True
+        for key in self._meta.video_keys:
+            del self._meta.features[key]
         for index, episode in self._episodes.items():
             if len(episode.features) == 0:
                 self._episodes[index] = self._encode(episode)
@@ -116,12 +129,6 @@ class EpisodeStore:
 
     def _open(self) -> LeRobotDataset:
         if self._dataset is None:
-            missing = [key for key in (OBS_STATE, ACTION, *self._cameras) if key not in self._meta.features]
-            if missing:
-                raise ValueError(
-                    f"Dataset '{self._meta.repo_id}' lacks {missing}; it has {sorted(self._meta.features)}. UF-RNN "
-                    "needs the joint state, the action and every camera that the policy was built with."
-                )
             window = [step / self._meta.fps for step in range(max(self.lengths))]
             self._dataset = LeRobotDataset(
                 self._meta.repo_id,

@@ -53,7 +53,6 @@ class FastUFRNN(UFRNN):
             network.image_cell.hidden_size,
             network.shared_cell.hidden_size,
         )
-        self._options = _options(network, foresight)
         self._packed: tuple[tuple[tuple[int, int], ...], _Packed] | None = None
         # Compiled code is made or loaded now, so that a robot's first tick does not wait for it.
         inputs = torch.zeros(1, network.joint_dim + network.feature_dim)
@@ -79,9 +78,10 @@ class FastUFRNN(UFRNN):
         self, inputs: Tensor, start: HiddenState, generator: Generator | None, packed: _Packed
     ) -> tuple[Prediction, HiddenState, ForesightTrace | None]:
         foresight, device = self.foresight, inputs.device
+        options = _options(self.network, foresight)
         batch_size, length = inputs.shape[:2]
         noise = torch.empty(batch_size, length, 1, 0)
-        if self._options.perturbs:
+        if options.perturbs:
             draws = [foresight.sample_noise(start, generator) for _ in range(length)]  # (N, B, S) each
             noise = torch.stack(draws).permute(2, 0, 1, 3)  # (B, L, N, S)
         hidden = torch.cat((start.h_joint, start.h_image, start.h_shared), dim=-1).unsqueeze(1)
@@ -89,7 +89,7 @@ class FastUFRNN(UFRNN):
         schedule = foresight.schedule
         episode = _Episode(
             self._sizes,
-            self._options,
+            options,
             packed.weights,
             _host(torch.stack((schedule.low, schedule.high))).numpy(),
             _host(noise).numpy(),
@@ -104,21 +104,7 @@ class FastUFRNN(UFRNN):
         states = HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)  # (B, L, hidden size) each
         prediction = self.network.predict(states)
         last = HiddenState(*(values[:, -1] for values in states))
-        return prediction, last, self._trace(steps, device) if self._options.selects else None
-
-    def _trace(self, steps: Steps, device: torch.device) -> ForesightTrace:
-        def time_first(values: np.ndarray) -> Tensor:  # (B, L, ...) -> (L, ..., B)
-            return torch.from_numpy(values).to(device).movedim(0, -1)
-
-        return ForesightTrace(
-            time_first(steps.noise_std).transpose(1, 2),
-            time_first(steps.chosen),
-            time_first(steps.baseline),
-            time_first(steps.final),
-            time_first(steps.horizon),
-            time_first(steps.calmest) if self._options.learned_horizon else None,
-            None,
-        )
+        return prediction, last, _trace(steps, options, device) if options.selects else None
 
     def _pack(self) -> _Packed:
         cells = Cells(*map(_host, pack_cells(self.network)))
@@ -138,6 +124,21 @@ class FastUFRNN(UFRNN):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_packed": None}
+
+
+def _trace(steps: Steps, options: Options, device: torch.device) -> ForesightTrace:
+    def time_first(values: np.ndarray) -> Tensor:  # (B, L, ...) -> (L, ..., B)
+        return torch.from_numpy(values).to(device).movedim(0, -1)
+
+    return ForesightTrace(
+        time_first(steps.noise_std).transpose(1, 2),
+        time_first(steps.chosen),
+        time_first(steps.baseline),
+        time_first(steps.final),
+        time_first(steps.horizon),
+        time_first(steps.calmest) if options.learned_horizon else None,
+        None,
+    )
 
 
 def _host(values: Tensor) -> Tensor:

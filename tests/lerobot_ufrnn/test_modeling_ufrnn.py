@@ -2,6 +2,7 @@ import threading
 
 import pytest
 import torch
+from lerobot.datasets import dataset_reader
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from oracle import Oracle
 from small import batch_of, make_dataset, observation, small_config, train
@@ -89,7 +90,8 @@ def test_the_pipelines_leave_values_alone(trained, dataset):
 def test_foresight_shows_what_it_saw(trained):
     trained.select_action(observation(2))
     trace = trained.last_trace
-    assert trace.means.shape == (2, 3, 2, 7)  # T, N, B, D
+    with pytest.raises(RuntimeError, match="kernel='reference'"):
+        _ = trace.imagined
     assert trace.final.shape == (3, 2)
     assert torch.equal(trace.chosen, trace.final.argmin(0))
 
@@ -190,6 +192,23 @@ def test_training_goes_through_both_phases_and_encodes_each_frame_once(dataset, 
     assert not all(torch.equal(old, new) for old, new in zip(recurrent, policy.model.parameters(), strict=True))
     assert sum(encoded) == 36
     assert all(not episode.images for episode in policy.episodes.loaded.values())
+
+
+def test_once_the_features_are_kept_the_loader_decodes_no_video(tmp_path, monkeypatch):
+    dataset = make_dataset(tmp_path / "dataset", (5, 5), use_videos=True)
+    decoded = []
+    decode = dataset_reader.decode_video_frames
+    monkeypatch.setattr(
+        dataset_reader, "decode_video_frames", lambda *args, **kwargs: decoded.append(1) or decode(*args, **kwargs)
+    )
+    policy = make_policy(small_config(autoencoder_steps=2), ds_meta=dataset.meta)
+    loader = torch.utils.data.DataLoader(torch.utils.data.Subset(dataset, [0, 5]), batch_size=2)
+    counts = []
+    for _ in range(5):
+        train(policy, list(loader))
+        counts.append(len(decoded))
+    # Two whole episodes and two frames, two frames, and from then on none.
+    assert counts == [4, 6, 6, 6, 6]
 
 
 def test_the_loss_falls(dataset):
@@ -327,9 +346,9 @@ def test_nan_in_a_dataset_is_found_and_placed(tmp_path):
 
 def test_a_camera_that_the_dataset_lacks_is_named(dataset, uneven_dataset):
     config = make_policy(small_config(), ds_meta=uneven_dataset.meta).config
-    policy = UFRNNPolicy(config, dataset_stats=dataset.meta.stats, dataset_meta=dataset.meta)
     with pytest.raises(ValueError, match=r"lacks \['observation.images.wrist'\]"):
-        policy.forward(batch_of(0))
+        UFRNNPolicy(config, dataset_stats=dataset.meta.stats, dataset_meta=dataset.meta)
+
 
 
 def test_an_episode_that_does_not_exist_is_refused(policy):
