@@ -11,6 +11,7 @@ COMMANDS = {
     "record": "record demonstrations of the scripted expert into a LeRobotDataset",
     "results": "turn the trial log of lerobot-eval into a table per door",
     "foresight": "draw what foresight imagines where the policy has to choose",
+    "benchmark": "time it against the readable code, XLA, ACT and Diffusion Policy",
 }
 
 USAGE = "usage: ufrnn COMMAND [--flag=value ...]\n\n" + "".join(

@@ -1,4 +1,4 @@
-"""One episode through the SH-LSTM: forth with foresight at every step, and back with exact gradients.
+"""Episodes through the SH-LSTM: forth with foresight at every step, and back with exact gradients.
 
 The formulas are those of `networks/sh_lstm.py` and `foresight.py`. A state is two rows, hidden and cell, with the parts
 `[joint | image | shared]`. Gates are in the order input, forget, output, candidate; the weights of the first three are
@@ -83,19 +83,19 @@ class Options(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Everything that a pass through an episode of L steps leaves behind; filled in place.
+    """Everything that a walk through L steps of B episodes leaves behind; filled in place.
 
     Attributes:
-        hidden (`np.ndarray`), cell (`np.ndarray`): state that is kept after each step, (L, H).
-        raw_cell (`np.ndarray`): cell state before it was perturbed, (L, H).
-        joint_input (`np.ndarray`): input of the joint cell, `[joints | h_shared]` (L, D_j + H_s).
-        image_input (`np.ndarray`): input of the image cell, `[features | h_shared]` (L, D_f + H_s).
-        shared_gates (`np.ndarray`), joint_gates (`np.ndarray`), image_gates (`np.ndarray`): (L, 4 hidden, padded).
-        noise_std (`np.ndarray`): standard deviation of the noise, joints first, (L, 2).
-        chosen (`np.ndarray`): kept candidate, (L,).
-        baseline (`np.ndarray`), final (`np.ndarray`): uncertainty before and at the horizon, (L, N).
-        horizon (`np.ndarray`): imagined steps that counted, (L, N).
-        calmest (`np.ndarray`): imagined step of least uncertainty, from 1, (L, N); with a learned horizon.
+        hidden (`np.ndarray`), cell (`np.ndarray`): state that is kept after each step, (L, B, H).
+        raw_cell (`np.ndarray`): cell state before it was perturbed, (L, B, H).
+        joint_input (`np.ndarray`): input of the joint cell, `[joints | h_shared]` (L, B, D_j + H_s).
+        image_input (`np.ndarray`): input of the image cell, `[features | h_shared]` (L, B, D_f + H_s).
+        shared_gates (`np.ndarray`), joint_gates (`np.ndarray`), image_gates (`np.ndarray`): (L, B, 4 hidden, padded).
+        noise_std (`np.ndarray`): standard deviation of the noise, joints first, (L, B, 2).
+        chosen (`np.ndarray`): kept candidate, (L, B).
+        baseline (`np.ndarray`), final (`np.ndarray`): uncertainty before and at the horizon, (L, N, B).
+        horizon (`np.ndarray`): imagined steps that counted, (L, N, B).
+        calmest (`np.ndarray`): imagined step of least uncertainty, from 1, (L, N, B); with a learned horizon.
     """
 
     hidden: np.ndarray
@@ -119,13 +119,13 @@ def _cell(gates: np.ndarray, cell: np.ndarray, hidden: np.ndarray, start: int, s
     """LSTM cell, given its gates: updates columns `start : start + size` of cell and hidden state."""
     half = gates.dtype.type(0.5)
     for row in range(gates.shape[0]):
+        input_gate, forget_gate = gates[row, :size], gates[row, size : 2 * size]
+        output_gate, candidate = gates[row, 2 * size : 3 * size], gates[row, 3 * size : 4 * size]
+        c, h = cell[row, start : start + size], hidden[row, start : start + size]
         for unit in range(size):
-            input_gate = half + half * gates[row, unit]
-            forget_gate = half + half * gates[row, size + unit]
-            output_gate = half + half * gates[row, 2 * size + unit]
-            value = forget_gate * cell[row, start + unit] + input_gate * gates[row, 3 * size + unit]
-            cell[row, start + unit] = value
-            hidden[row, start + unit] = output_gate * tanh(value)
+            c[unit] = (half + half * forget_gate[unit]) * c[unit] + (half + half * input_gate[unit]) * candidate[unit]
+        for unit in range(size):
+            h[unit] = (half + half * output_gate[unit]) * tanh(c[unit])
 
 
 @compiled
@@ -147,9 +147,11 @@ def _step(
     tanh_all(shared_gates)
     _cell(shared_gates, cell, hidden, shared_start, sizes.shared_hidden)
     for row in range(hidden.shape[0]):
+        shared = hidden[row, shared_start:]
+        to_joint, to_image = joint_input[row, sizes.joint_dim :], image_input[row, sizes.feature_dim :]
         for unit in range(sizes.shared_hidden):
-            joint_input[row, sizes.joint_dim + unit] = hidden[row, shared_start + unit]
-            image_input[row, sizes.feature_dim + unit] = hidden[row, shared_start + unit]
+            to_joint[unit] = shared[unit]
+            to_image[unit] = shared[unit]
     multiply_add(joint_input, weights.joint, weights.joint_bias, joint_gates)
     tanh_all(joint_gates)
     _cell(joint_gates, cell, hidden, joint_start, sizes.joint_hidden)
@@ -170,21 +172,24 @@ def _imagine_inputs(
     """Writes the predicted means to the sensor columns of the two inputs."""
     image_start, image_stop = sizes.joint_hidden, sizes.joint_hidden + sizes.image_hidden
     multiply_add(hidden[:, :image_start], weights.joint_mean, weights.joint_mean_bias, scratch)
+    tanh_all(scratch)
     for row in range(hidden.shape[0]):
         for index in range(sizes.joint_dim):
-            joint_input[row, index] = tanh(scratch[row, index])
+            joint_input[row, index] = scratch[row, index]
     multiply_add(hidden[:, image_start:image_stop], weights.image_mean, weights.image_mean_bias, scratch)
+    tanh_all(scratch)
     for row in range(hidden.shape[0]):
         for index in range(sizes.feature_dim):
-            image_input[row, index] = tanh(scratch[row, index])
+            image_input[row, index] = scratch[row, index]
 
 
 @compiled
 def _mean_spread(raw: np.ndarray, size: int, low: float, high: float, entropy: bool) -> float:
     """Mean variance (or log-variance) of `size` dimensions; `bound_log_variance` and its exponential in one."""
+    least, most = math.exp(low), math.exp(high)
     total = 0.0
     for index in range(size):
-        variance = math.exp(low) + math.exp(high) / (1 + math.exp(high - raw[index]))
+        variance = least + most / (1 + most * math.exp(-raw[index]))
         total += math.log(variance) if entropy else variance
     return total / size
 
@@ -223,6 +228,18 @@ def _schedule(options: Options, low: float, high: float, variance: float) -> flo
 
 
 @compiled
+def _add_noise(values: np.ndarray, std: float, noise: np.ndarray, column: int, out: np.ndarray) -> None:
+    """Writes `values` with the noise from `column` on, or without where `column` is -1."""
+    if column < 0:
+        for unit in range(values.shape[0]):
+            out[unit] = values[unit]
+    else:
+        part = noise[column : column + values.shape[0]]
+        for unit in range(values.shape[0]):
+            out[unit] = values[unit] + std * part[unit]
+
+
+@compiled
 def _perturb(
     options: Options,
     sizes: Sizes,
@@ -238,17 +255,10 @@ def _perturb(
     for part in range(3):
         size = (sizes.joint_hidden, sizes.image_hidden, sizes.shared_hidden)[part]
         std = noise_std[part] if part < 2 else (noise_std[0] + noise_std[1]) / noise_std.dtype.type(2)
-        column = options.noise_columns[2 * part]
-        for unit in range(size):
-            hidden[start + unit] = from_hidden[start + unit]
-            if column >= 0:
-                hidden[start + unit] += std * noise[column + unit]
-        column = options.noise_columns[2 * part + 1]
-        for unit in range(size):
-            cell[start + unit] = from_cell[start + unit]
-            if column >= 0:
-                cell[start + unit] += std * noise[column + unit]
-        start += size
+        stop = start + size
+        _add_noise(from_hidden[start:stop], std, noise, options.noise_columns[2 * part], hidden[start:stop])
+        _add_noise(from_cell[start:stop], std, noise, options.noise_columns[2 * part + 1], cell[start:stop])
+        start = stop
 
 
 @compiled
@@ -259,11 +269,15 @@ def walk(
     noise_bounds: np.ndarray,
     inputs: np.ndarray,
     noise: np.ndarray,
-    hidden: np.ndarray,
-    cell: np.ndarray,
+    first_hidden: np.ndarray,
+    first_cell: np.ndarray,
     steps: Steps,
+    first: int,
+    last: int,
 ) -> None:
-    """Walks one episode: read the inputs, explore, keep the state whose future is least uncertain.
+    """Walks episodes `first` to `last - 1` of B: read the inputs, explore, keep the calmest future's state.
+
+    All candidates of all these episodes go through the network together, so that each weight is fetched once a step.
 
     Args:
         weights (`Weights`):
@@ -275,68 +289,88 @@ def walk(
         noise_bounds (`np.ndarray`):
             `low` and `high` of the `NoiseSchedule`, (2, 2).
         inputs (`np.ndarray`):
-            Scaled joints and image features, (L, D).
+            Scaled joints and image features, (L, B, D).
         noise (`np.ndarray`):
-            Standard normal numbers, (L, N, noise columns).
-        hidden (`np.ndarray`), cell (`np.ndarray`):
-            State before the first step, (1, H); afterwards the state that was kept last.
+            Standard normal numbers, (L, N, B, noise columns).
+        first_hidden (`np.ndarray`), first_cell (`np.ndarray`):
+            States before the first step, (B, H).
         steps (`Steps`):
             Where to write what happened.
+        first (`int`), last (`int`):
+            Which episodes.
     """
+    hidden, cell = first_hidden[first:last].copy(), first_cell[first:last].copy()
     number = hidden.dtype
-    num_samples, size = noise.shape[1], hidden.shape[1]
-    widest = max(weights.joint_spread_bias.shape[0], weights.image_spread_bias.shape[0])
-    scratch = np.empty((num_samples, widest), number)
-    means, step_scalars = np.empty((num_samples, 2), number), np.empty((num_samples, 2), number)
-    noisy_hidden, noisy_cell = np.empty((num_samples, size), number), np.empty((num_samples, size), number)
-    joint_input = np.empty((num_samples, steps.joint_input.shape[1]), number)
-    image_input = np.empty((num_samples, steps.image_input.shape[1]), number)
-    shared_gates = np.empty((num_samples, steps.shared_gates.shape[1]), number)
-    joint_gates = np.empty((num_samples, steps.joint_gates.shape[1]), number)
-    image_gates = np.empty((num_samples, steps.image_gates.shape[1]), number)
-    uncertainties = np.empty((options.horizon, num_samples), number)
+    num_samples, num_episodes, size = noise.shape[1], hidden.shape[0], hidden.shape[1]
+    num_rows = num_samples * num_episodes  # candidate-major
+    scratch = np.zeros((num_rows, max(weights.joint_spread_bias.shape[0], weights.image_spread_bias.shape[0])), number)
+    means, step_scalars = np.empty((num_rows, 2), number), np.empty((num_rows, 2), number)
+    noisy_hidden, noisy_cell = np.empty((num_rows, size), number), np.empty((num_rows, size), number)
+    joint_input = np.empty((num_rows, steps.joint_input.shape[2]), number)
+    image_input = np.empty((num_rows, steps.image_input.shape[2]), number)
+    shared_gates = np.empty((num_rows, steps.shared_gates.shape[2]), number)
+    joint_gates = np.empty((num_rows, steps.joint_gates.shape[2]), number)
+    image_gates = np.empty((num_rows, steps.image_gates.shape[2]), number)
+    uncertainties = np.empty((options.horizon, num_rows), number)
 
     for t in range(inputs.shape[0]):
-        noise_std = steps.noise_std[t]
+        noise_std = steps.noise_std[t, first:last]
         if options.perturbs:
             # The variance that the step before predicted for this one sets the noise.
             _uncertainty(weights, sizes, options, False, hidden, scratch, means, step_scalars)
-            for modality in range(2):
-                low, high = noise_bounds[0, modality], noise_bounds[1, modality]
-                noise_std[modality] = _schedule(options, low, high, means[0, modality])
+            for episode in range(num_episodes):
+                for modality in range(2):
+                    low, high = noise_bounds[0, modality], noise_bounds[1, modality]
+                    noise_std[episode, modality] = _schedule(options, low, high, means[episode, modality])
             if options.entropy:
                 _uncertainty(weights, sizes, options, True, hidden, scratch, means, step_scalars)
-            steps.baseline[t, :] = means[0, 0] + means[0, 1]
+            for n in range(num_samples):
+                for episode in range(num_episodes):
+                    steps.baseline[t, n, first + episode] = means[episode, 0] + means[episode, 1]
 
-        now = slice(t, t + 1)
-        steps.joint_input[t, : sizes.joint_dim] = inputs[t, : sizes.joint_dim]
-        steps.image_input[t, : sizes.feature_dim] = inputs[t, sizes.joint_dim :]
+        for episode in range(num_episodes):
+            for index in range(sizes.joint_dim):
+                steps.joint_input[t, first + episode, index] = inputs[t, first + episode, index]
+            for index in range(sizes.feature_dim):
+                steps.image_input[t, first + episode, index] = inputs[t, first + episode, sizes.joint_dim + index]
         _step(
             weights,
             sizes,
             hidden,
             cell,
-            steps.joint_input[now],
-            steps.image_input[now],
-            steps.shared_gates[now],
-            steps.joint_gates[now],
-            steps.image_gates[now],
+            steps.joint_input[t, first:last],
+            steps.image_input[t, first:last],
+            steps.shared_gates[t, first:last],
+            steps.joint_gates[t, first:last],
+            steps.image_gates[t, first:last],
         )
-        steps.raw_cell[t] = cell[0]
+        steps.raw_cell[t, first:last] = cell
 
-        chosen = 0
+        for episode in range(num_episodes):
+            steps.chosen[t, first + episode] = 0
         if options.selects:
-            for n in range(num_samples):
-                _perturb(options, sizes, noise[t, n], noise_std, hidden[0], cell[0], noisy_hidden[n], noisy_cell[n])
-            steps.horizon[t, :] = options.horizon
+            for row in range(num_rows):
+                n, episode = row // num_episodes, row % num_episodes
+                _perturb(
+                    options,
+                    sizes,
+                    noise[t, n, first + episode],
+                    noise_std[episode],
+                    hidden[episode],
+                    cell[episode],
+                    noisy_hidden[row],
+                    noisy_cell[row],
+                )
+                steps.horizon[t, n, first + episode] = options.horizon
             if options.own_baseline or options.learned_horizon:
                 _uncertainty(weights, sizes, options, options.entropy, noisy_hidden, scratch, means, step_scalars)
-                for n in range(num_samples):
+                for row in range(num_rows):
+                    n, episode = row // num_episodes, row % num_episodes
                     if options.own_baseline:
-                        steps.baseline[t, n] = means[n, 0] + means[n, 1]
+                        steps.baseline[t, n, first + episode] = means[row, 0] + means[row, 1]
                     if options.learned_horizon:
-                        fraction = 1 / (1 + math.exp(-max(step_scalars[n, 0], step_scalars[n, 1])))
-                        steps.horizon[t, n] = max(1, math.ceil(options.horizon * fraction))
+                        fraction = 1 / (1 + math.exp(-max(step_scalars[row, 0], step_scalars[row, 1])))
+                        steps.horizon[t, n, first + episode] = max(1, math.ceil(options.horizon * fraction))
             for future in range(options.horizon):
                 _imagine_inputs(weights, sizes, noisy_hidden, joint_input, image_input, scratch)
                 _step(
@@ -352,19 +386,31 @@ def walk(
                 )
                 if options.learned_horizon or future == options.horizon - 1:
                     _uncertainty(weights, sizes, options, options.entropy, noisy_hidden, scratch, means, step_scalars)
-                    for n in range(num_samples):
-                        uncertainties[future, n] = means[n, 0] + means[n, 1]
-            for n in range(num_samples):
-                steps.final[t, n] = uncertainties[steps.horizon[t, n] - 1, n]
+                    for row in range(num_rows):
+                        uncertainties[future, row] = means[row, 0] + means[row, 1]
+            for row in range(num_rows):
+                n, episode = row // num_episodes, first + row % num_episodes
+                steps.final[t, n, episode] = uncertainties[steps.horizon[t, n, episode] - 1, row]
                 if options.learned_horizon:
-                    steps.calmest[t, n] = 1 + np.argmin(uncertainties[:, n])
-                if steps.baseline[t, n] - steps.final[t, n] > steps.baseline[t, chosen] - steps.final[t, chosen]:
-                    chosen = n
-        steps.chosen[t] = chosen
+                    steps.calmest[t, n, episode] = 1 + np.argmin(uncertainties[:, row])
+                best = steps.chosen[t, episode]
+                fall = steps.baseline[t, n, episode] - steps.final[t, n, episode]
+                if fall > steps.baseline[t, best, episode] - steps.final[t, best, episode]:
+                    steps.chosen[t, episode] = n
         if options.perturbs:
-            _perturb(options, sizes, noise[t, chosen], noise_std, hidden[0], cell[0], hidden[0], cell[0])
-        steps.hidden[t] = hidden[0]
-        steps.cell[t] = cell[0]
+            for episode in range(num_episodes):
+                _perturb(
+                    options,
+                    sizes,
+                    noise[t, steps.chosen[t, first + episode], first + episode],
+                    noise_std[episode],
+                    hidden[episode],
+                    cell[episode],
+                    hidden[episode],
+                    cell[episode],
+                )
+        steps.hidden[t, first:last] = hidden
+        steps.cell[t, first:last] = cell
 
 
 @compiled
@@ -380,18 +426,20 @@ def _cell_backward(
 ) -> None:
     """Back through `_cell`: fills the gradient of the gates before tanh; `grad_cell` becomes that of the last cell."""
     one, half = gates.dtype.type(1), gates.dtype.type(0.5)
-    for unit in range(size):
-        i, f, o = gates[unit], gates[size + unit], gates[2 * size + unit]
-        candidate = gates[3 * size + unit]
-        input_gate, forget_gate, output_gate = half + half * i, half + half * f, half + half * o
-        squashed = tanh(raw_cell[start + unit])
-        grad_h = grad_hidden[start + unit]
-        grad_c = grad_cell[start + unit] + grad_h * output_gate * (one - squashed * squashed)
-        grad_gates[unit] = grad_c * candidate * half * (one - i * i)
-        grad_gates[size + unit] = grad_c * previous_cell[start + unit] * half * (one - f * f)
-        grad_gates[2 * size + unit] = grad_h * squashed * half * (one - o * o)
-        grad_gates[3 * size + unit] = grad_c * input_gate * (one - candidate * candidate)
-        grad_cell[start + unit] = grad_c * forget_gate
+    stop = start + size
+    for row in range(gates.shape[0]):
+        gate, grad_gate = gates[row], grad_gates[row]
+        before, after = previous_cell[row, start:stop], raw_cell[row, start:stop]
+        grad_h, grad_c = grad_hidden[row, start:stop], grad_cell[row, start:stop]
+        for unit in range(size):
+            i, f, o, candidate = gate[unit], gate[size + unit], gate[2 * size + unit], gate[3 * size + unit]
+            squashed = tanh(after[unit])
+            grad = grad_c[unit] + grad_h[unit] * (half + half * o) * (one - squashed * squashed)
+            grad_gate[unit] = grad * candidate * half * (one - i * i)
+            grad_gate[size + unit] = grad * before[unit] * half * (one - f * f)
+            grad_gate[2 * size + unit] = grad_h[unit] * squashed * half * (one - o * o)
+            grad_gate[3 * size + unit] = grad * (half + half * i) * (one - candidate * candidate)
+            grad_c[unit] = grad * (half + half * f)
 
 
 class TransposedWeights(NamedTuple):
@@ -411,7 +459,7 @@ class TransposedWeights(NamedTuple):
 
 
 class GateGradients(NamedTuple):
-    """Gradients of the gates before tanh over an episode, (L, 4 hidden, padded) each; padding is zero."""
+    """Gradients of the gates before tanh, (L, B, 4 hidden, padded) each; padding is zero."""
 
     shared: np.ndarray
     joint: np.ndarray
@@ -426,6 +474,8 @@ def walk_back(
     first_cell: np.ndarray,
     grad_kept: np.ndarray,
     gradients: GateGradients,
+    first: int,
+    last: int,
 ) -> None:
     """Back-propagation through time along `walk`; noise and selection carry no gradient.
 
@@ -437,59 +487,45 @@ def walk_back(
         steps (`Steps`):
             What `walk` left behind.
         first_cell (`np.ndarray`):
-            Cell state before the first step, (H,).
+            Cell states before the first step, (B, H).
         grad_kept (`np.ndarray`):
-            Gradient of the loss by `steps.hidden`, (L, H).
+            Gradient of the loss by `steps.hidden`, (L, B, H).
         gradients (`GateGradients`):
             Where to write; holds zeros before.
+        first (`int`), last (`int`):
+            Which episodes.
     """
-    number = grad_kept.dtype
-    image_start = sizes.joint_hidden
-    shared_start = image_start + sizes.image_hidden
-    size = shared_start + sizes.shared_hidden
-    grad_hidden = np.empty((1, size), number)
-    grad_cell = np.zeros(size, number)
-    from_next = np.zeros((1, weights.shared.shape[0] * PANEL), number)
-    to_shared = np.empty((1, weights.joint.shape[0] * PANEL), number)
+    number, num_episodes = grad_kept.dtype, last - first
+    joint, image, shared = sizes.joint_hidden, sizes.image_hidden, sizes.shared_hidden
+    grad_hidden = np.empty((num_episodes, joint + image + shared), number)
+    grad_cell = np.zeros((num_episodes, joint + image + shared), number)
+    from_next = np.zeros((num_episodes, weights.shared.shape[0] * PANEL), number)
+    to_shared = np.empty((num_episodes, weights.joint.shape[0] * PANEL), number)
     for t in range(grad_kept.shape[0] - 1, -1, -1):
-        for unit in range(size):
-            grad_hidden[0, unit] = grad_kept[t, unit] + from_next[0, unit]
-        previous_cell = steps.cell[t - 1] if t > 0 else first_cell
-        raw_cell = steps.raw_cell[t]
-        _cell_backward(
-            steps.joint_gates[t],
-            previous_cell,
-            raw_cell,
-            0,
-            sizes.joint_hidden,
-            grad_hidden[0],
-            grad_cell,
-            gradients.joint[t],
-        )
-        multiply_add(gradients.joint[t : t + 1], weights.joint, weights.zeros, to_shared)
-        for unit in range(sizes.shared_hidden):
-            grad_hidden[0, shared_start + unit] += to_shared[0, unit]
-        _cell_backward(
-            steps.image_gates[t],
-            previous_cell,
-            raw_cell,
-            image_start,
-            sizes.image_hidden,
-            grad_hidden[0],
-            grad_cell,
-            gradients.image[t],
-        )
-        multiply_add(gradients.image[t : t + 1], weights.image, weights.zeros, to_shared)
-        for unit in range(sizes.shared_hidden):
-            grad_hidden[0, shared_start + unit] += to_shared[0, unit]
-        _cell_backward(
-            steps.shared_gates[t],
-            previous_cell,
-            raw_cell,
-            shared_start,
-            sizes.shared_hidden,
-            grad_hidden[0],
-            grad_cell,
-            gradients.shared[t],
-        )
-        multiply_add(gradients.shared[t : t + 1], weights.shared, weights.zeros, from_next)
+        for episode in range(num_episodes):
+            for unit in range(grad_hidden.shape[1]):
+                grad_hidden[episode, unit] = grad_kept[t, first + episode, unit] + from_next[episode, unit]
+        previous_cell = steps.cell[t - 1, first:last] if t > 0 else first_cell[first:last]
+        raw_cell = steps.raw_cell[t, first:last]
+
+        gates, grad_gates = steps.joint_gates[t, first:last], gradients.joint[t, first:last]
+        _cell_backward(gates, previous_cell, raw_cell, 0, joint, grad_hidden, grad_cell, grad_gates)
+        multiply_add(grad_gates, weights.joint, weights.zeros, to_shared)
+        _add_columns(to_shared, grad_hidden, joint + image, shared)
+
+        gates, grad_gates = steps.image_gates[t, first:last], gradients.image[t, first:last]
+        _cell_backward(gates, previous_cell, raw_cell, joint, image, grad_hidden, grad_cell, grad_gates)
+        multiply_add(grad_gates, weights.image, weights.zeros, to_shared)
+        _add_columns(to_shared, grad_hidden, joint + image, shared)
+
+        gates, grad_gates = steps.shared_gates[t, first:last], gradients.shared[t, first:last]
+        _cell_backward(gates, previous_cell, raw_cell, joint + image, shared, grad_hidden, grad_cell, grad_gates)
+        multiply_add(grad_gates, weights.shared, weights.zeros, from_next)
+
+
+@compiled
+def _add_columns(values: np.ndarray, out: np.ndarray, start: int, size: int) -> None:
+    for row in range(values.shape[0]):
+        part = out[row, start : start + size]
+        for column in range(size):
+            part[column] += values[row, column]

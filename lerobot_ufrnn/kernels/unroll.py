@@ -1,7 +1,7 @@
 """UF-RNN with the compiled kernel: same signature, same numbers, a fraction of the time."""
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, NamedTuple
@@ -64,7 +64,7 @@ class FastUFRNN(UFRNN):
         """See [`UFRNN.advance`]; carries no gradient."""
         with torch.no_grad(), torch.autocast(inputs.device.type, enabled=False):
             prediction, state, trace = self._walk(inputs.unsqueeze(1), memory.state, generator, self._pack_once())
-        now = Prediction(*(values[:, 0] for values in prediction))
+        now = Prediction(*(values[0] for values in prediction))
         return Memory(state, now), None if trace is None else trace.at(0)
 
     def forward(self, inputs: Tensor, generator: Generator | None = None) -> tuple[Prediction, ForesightTrace | None]:
@@ -72,22 +72,22 @@ class FastUFRNN(UFRNN):
         start = self.network.initial_state(inputs.shape[0])
         with torch.autocast(inputs.device.type, enabled=False):
             prediction, _, trace = self._walk(inputs, start, generator, self._pack())
-        return prediction, trace
+        return Prediction(*(values.transpose(0, 1) for values in prediction)), trace
 
     def _walk(
         self, inputs: Tensor, start: HiddenState, generator: Generator | None, packed: _Packed
     ) -> tuple[Prediction, HiddenState, ForesightTrace | None]:
+        """Predictions over time (L, B, ...), the last state (B, ...) and the trace of all steps."""
         foresight, device = self.foresight, inputs.device
         options = _options(self.network, foresight)
         batch_size, length = inputs.shape[:2]
-        noise = torch.empty(batch_size, length, 1, 0)
+        noise = torch.empty(length, 1, batch_size, 0)
         if options.perturbs:
-            draws = [foresight.sample_noise(start, generator) for _ in range(length)]  # (N, B, S) each
-            noise = torch.stack(draws).permute(2, 0, 1, 3)  # (B, L, N, S)
-        hidden = torch.cat((start.h_joint, start.h_image, start.h_shared), dim=-1).unsqueeze(1)
-        cell = torch.cat((start.c_joint, start.c_image, start.c_shared), dim=-1).unsqueeze(1)
+            noise = torch.stack([foresight.sample_noise(start, generator) for _ in range(length)])  # (L, N, B, S)
+        hidden = torch.cat((start.h_joint, start.h_image, start.h_shared), dim=-1)
+        cell = torch.cat((start.c_joint, start.c_image, start.c_shared), dim=-1)
         schedule = foresight.schedule
-        episode = _Episode(
+        episodes = _Episodes(
             self._sizes,
             options,
             packed.weights,
@@ -96,14 +96,18 @@ class FastUFRNN(UFRNN):
             _host(hidden).numpy(),
             _host(cell).numpy(),
         )
-        kept = _Walk.apply(episode, _host(inputs), *packed.cells)
-        steps = episode.steps
+        steps, inputs = episodes.steps, _host(inputs.transpose(0, 1))
+        if torch.is_grad_enabled():
+            kept = _Walk.apply(episodes, inputs, *packed.cells)
+        else:
+            episodes.walk(inputs.numpy())
+            kept = torch.from_numpy(steps.hidden)
         parts = self._sizes[2:]
         h_joint, h_image, h_shared = kept.to(device).split(parts, dim=-1)
         c_joint, c_image, c_shared = torch.from_numpy(steps.cell).to(device).split(parts, dim=-1)
-        states = HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)  # (B, L, hidden size) each
+        states = HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)  # (L, B, hidden size) each
         prediction = self.network.predict(states)
-        last = HiddenState(*(values[:, -1] for values in states))
+        last = HiddenState(*(values[-1] for values in states))
         return prediction, last, _trace(steps, options, device) if options.selects else None
 
     def _pack(self) -> _Packed:
@@ -116,7 +120,8 @@ class FastUFRNN(UFRNN):
         versions = tuple(
             (parameter.data_ptr(), parameter._version)
             for layer in self.network.children()
-            for parameter in layer.parameters(recurse=False)
+            for parameter in layer._parameters.values()
+            if parameter is not None
         )
         if self._packed is None or self._packed[0] != versions:
             self._packed = versions, self._pack()
@@ -127,17 +132,12 @@ class FastUFRNN(UFRNN):
 
 
 def _trace(steps: Steps, options: Options, device: torch.device) -> ForesightTrace:
-    def time_first(values: np.ndarray) -> Tensor:  # (B, L, ...) -> (L, ..., B)
-        return torch.from_numpy(values).to(device).movedim(0, -1)
-
+    noise_std, chosen, baseline, final, horizon, calmest = (
+        torch.from_numpy(values).to(device)
+        for values in (steps.noise_std, steps.chosen, steps.baseline, steps.final, steps.horizon, steps.calmest)
+    )
     return ForesightTrace(
-        time_first(steps.noise_std).transpose(1, 2),
-        time_first(steps.chosen),
-        time_first(steps.baseline),
-        time_first(steps.final),
-        time_first(steps.horizon),
-        time_first(steps.calmest) if options.learned_horizon else None,
-        None,
+        noise_std, chosen, baseline, final, horizon, calmest if options.learned_horizon else None, None
     )
 
 
@@ -171,7 +171,7 @@ def _options(network: SHLSTM, foresight: Foresight) -> Options:
     )
 
 
-class _Episode:
+class _Episodes:
     """A batch of episodes on their way through `walk` and `walk_back`."""
 
     def __init__(
@@ -181,52 +181,55 @@ class _Episode:
         weights: Weights,
         noise_bounds: np.ndarray,
         noise: np.ndarray,
-        hidden: np.ndarray,
-        cell: np.ndarray,
+        first_hidden: np.ndarray,
+        first_cell: np.ndarray,
     ):
         self.sizes, self.options, self.weights = sizes, options, weights
         self.noise_bounds, self.noise = noise_bounds, noise
-        self.first_hidden, self.first_cell = hidden, cell
-        batch_size, length, num_samples = noise.shape[:3]
-        number, hidden_size = hidden.dtype, hidden.shape[-1]
+        self.first_hidden, self.first_cell = first_hidden, first_cell
+        length, num_samples, batch_size, _ = noise.shape
+        number, hidden_size = first_hidden.dtype, first_hidden.shape[-1]
 
-        def empty(*shape: int, dtype: Any = number) -> np.ndarray:
-            return np.empty((batch_size, length, *shape), dtype)
+        def of_episodes(*shape: int) -> np.ndarray:
+            return np.empty((length, batch_size, *shape), number)
+
+        def of_candidates(dtype: Any) -> np.ndarray:
+            return np.empty((length, num_samples, batch_size), dtype)
 
         self.steps = Steps(
-            empty(hidden_size),
-            empty(hidden_size),
-            empty(hidden_size),
-            empty(sizes.joint_dim + sizes.shared_hidden),
-            empty(sizes.feature_dim + sizes.shared_hidden),
-            empty(len(weights.shared_bias)),
-            empty(len(weights.joint_bias)),
-            empty(len(weights.image_bias)),
-            empty(2),
-            empty(dtype=np.int64),
-            empty(num_samples),
-            empty(num_samples),
-            empty(num_samples, dtype=np.int64),
-            empty(num_samples, dtype=np.int64),
+            hidden=of_episodes(hidden_size),
+            cell=of_episodes(hidden_size),
+            raw_cell=of_episodes(hidden_size),
+            joint_input=of_episodes(sizes.joint_dim + sizes.shared_hidden),
+            image_input=of_episodes(sizes.feature_dim + sizes.shared_hidden),
+            shared_gates=of_episodes(len(weights.shared_bias)),
+            joint_gates=of_episodes(len(weights.joint_bias)),
+            image_gates=of_episodes(len(weights.image_bias)),
+            noise_std=of_episodes(2),
+            chosen=np.empty((length, batch_size), np.int64),
+            baseline=of_candidates(number),
+            final=of_candidates(number),
+            horizon=of_candidates(np.int64),
+            calmest=of_candidates(np.int64),
         )
 
     def walk(self, inputs: np.ndarray) -> None:
-        hidden, cell = self.first_hidden.copy(), self.first_cell.copy()
-
-        def one(row: int) -> None:
+        def some(first: int, last: int) -> None:
             walk(
                 self.weights,
                 self.sizes,
                 self.options,
                 self.noise_bounds,
-                inputs[row],
-                self.noise[row],
-                hidden[row],
-                cell[row],
-                Steps(*(values[row] for values in self.steps)),
+                inputs,
+                self.noise,
+                self.first_hidden,
+                self.first_cell,
+                self.steps,
+                first,
+                last,
             )
 
-        _for_each(one, len(inputs))
+        _share(some, inputs.shape[1])
 
     def walk_back(self, grad_kept: np.ndarray) -> GateGradients:
         weights, sizes, steps = self.weights, self.sizes, self.steps
@@ -241,36 +244,29 @@ class _Episode:
             *(np.zeros_like(gates) for gates in (steps.shared_gates, steps.joint_gates, steps.image_gates))
         )
 
-        def one(row: int) -> None:
-            walk_back(
-                transposed,
-                sizes,
-                Steps(*(values[row] for values in steps)),
-                self.first_cell[row, 0],
-                grad_kept[row],
-                GateGradients(*(values[row] for values in gradients)),
-            )
+        def some(first: int, last: int) -> None:
+            walk_back(transposed, sizes, steps, self.first_cell, grad_kept, gradients, first, last)
 
-        _for_each(one, len(grad_kept))
+        _share(some, grad_kept.shape[1])
         return gradients
 
 
 class _Walk(torch.autograd.Function):
-    """Kept hidden states (B, L, H) of a batch of episodes; exact gradients of the inputs and of the cells' weights."""
+    """Kept hidden states (L, B, H) of a batch of episodes; exact gradients of the inputs and of the cells' weights."""
 
     @staticmethod
-    def forward(ctx: Any, episode: _Episode, inputs: Tensor, *cells: Tensor) -> Tensor:
-        episode.walk(inputs.detach().numpy())
-        ctx.episode = episode
-        return torch.from_numpy(episode.steps.hidden)
+    def forward(ctx: Any, episodes: _Episodes, inputs: Tensor, *cells: Tensor) -> Tensor:
+        episodes.walk(inputs.detach().numpy())
+        ctx.episodes = episodes
+        return torch.from_numpy(episodes.steps.hidden)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_kept: Tensor) -> tuple[Tensor | None, ...]:
-        episode: _Episode = ctx.episode
-        sizes, weights, steps = episode.sizes, episode.weights, episode.steps
-        gates = [torch.from_numpy(values) for values in episode.walk_back(grad_kept.contiguous().numpy())]
-        before = np.concatenate((episode.first_hidden, steps.hidden[:, :-1]), axis=1)
+        episodes: _Episodes = ctx.episodes
+        sizes, weights, steps = episodes.sizes, episodes.weights, episodes.steps
+        gates = [torch.from_numpy(values) for values in episodes.walk_back(grad_kept.contiguous().numpy())]
+        before = np.concatenate((episodes.first_hidden[None], steps.hidden[:-1]))
         cells: list[Tensor] = []
         for values, gradient in zip((before, steps.joint_input, steps.image_input), gates, strict=True):
             weight = torch.from_numpy(values).flatten(0, 1).T @ gradient.flatten(0, 1)
@@ -293,11 +289,12 @@ def _pool(num_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_threads, thread_name_prefix="ufrnn")
 
 
-def _for_each(function: Callable[[int], None], count: int) -> None:
-    """Calls `function` for each row, on as many threads as PyTorch uses."""
+def _share(function: Callable[[int, int], None], count: int) -> None:
+    """Calls `function(first, last)` for shares of `count` episodes, on as many threads as PyTorch uses."""
     num_threads = min(torch.get_num_threads(), count)
-    calls: Iterable[None] = map(function, range(count))
-    if num_threads > 1:
-        calls = _pool(num_threads).map(function, range(count))
-    for _ in calls:
-        pass
+    if num_threads == 1:
+        function(0, count)
+        return
+    bounds = [count * index // num_threads for index in range(num_threads + 1)]
+    for _ in _pool(num_threads).map(function, bounds[:-1], bounds[1:]):
+        pass  # asks for each result, so that an error is raised here

@@ -29,7 +29,7 @@ class RangeScaler(nn.Module):
     @property
     def is_fitted(self) -> bool:
         """`bool`: whether `fit` was called or a fitted range was loaded."""
-        return bool((self.high > self.low).any())
+        return not torch.equal(self.high, self.low)
 
     @torch.no_grad()
     def fit(self, low: Tensor, high: Tensor, floor: float = 1e-3) -> None:
@@ -60,12 +60,12 @@ class RangeScaler(nn.Module):
     def scale(self, value: Tensor) -> Tensor:
         """Maps `value` (..., D) from its own unit into the network's range."""
         self._require_fitted()
-        return ((value - self.low) / (self.high - self.low) * 2 - 1) * SCALED_LIMIT
+        return (value - self.low) * (2 * SCALED_LIMIT / (self.high - self.low)) - SCALED_LIMIT
 
     def unscale(self, value: Tensor) -> Tensor:
         """Maps `value` (..., D) from the network's range back to its own unit."""
         self._require_fitted()
-        return (value / SCALED_LIMIT + 1) / 2 * (self.high - self.low) + self.low
+        return (value + SCALED_LIMIT) * ((self.high - self.low) / (2 * SCALED_LIMIT)) + self.low
 
     def _require_fitted(self) -> None:
         if not self.is_fitted:

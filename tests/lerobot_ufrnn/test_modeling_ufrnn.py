@@ -350,7 +350,6 @@ def test_a_camera_that_the_dataset_lacks_is_named(dataset, uneven_dataset):
         UFRNNPolicy(config, dataset_stats=dataset.meta.stats, dataset_meta=dataset.meta)
 
 
-
 def test_an_episode_that_does_not_exist_is_refused(policy):
     with pytest.raises(ValueError, match="Episode 3 does not exist"):
         policy.forward(batch_of(3))
