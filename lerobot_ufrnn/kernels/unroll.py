@@ -1,6 +1,5 @@
 """UF-RNN with the compiled kernel: same signature, same numbers, a fraction of the time."""
 
-import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -17,8 +16,6 @@ from ..recurrent import UFRNN, Memory
 from .matmul import PANEL
 from .packing import Cells, Heads, pack_cells, pack_heads, to_panels
 from .sequence import GateGradients, Options, Sizes, Steps, TransposedWeights, Weights, walk, walk_back
-
-logger = logging.getLogger(__name__)
 
 
 class _Packed(NamedTuple):
