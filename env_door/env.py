@@ -52,7 +52,7 @@ class DoorEnv(gym.Env):
             folding up.
         observation_size (`int`, *optional*, defaults to `128`):
             Height and width of the observed image in pixels.
-        render_size (`int`, *optional*, defaults to `256`):
+        render_size (`int`, *optional*, defaults to `192`):
             Height and width of the picture that `render` returns, at most 768.
         render_mode (`str`, *optional*, defaults to `"rgb_array"`):
             Only `"rgb_array"`.
@@ -70,7 +70,7 @@ class DoorEnv(gym.Env):
         start_variation: float = 0.02,
         command_limit: float = 0.08,
         observation_size: int = 128,
-        render_size: int = 256,
+        render_size: int = 192,
         render_mode: str = "rgb_array",
     ):
         _check_kind(kind)

@@ -73,10 +73,12 @@ def describe_machine() -> dict[str, str]:
     return machine
 
 
-def to_markdown(sections: Sequence[Section], machine: dict[str, str]) -> str:
+def to_markdown(title: str, sections: Sequence[Section], machine: dict[str, str]) -> str:
     """The report to read.
 
     Args:
+        title (`str`):
+            Heading.
         sections (`Sequence[Section]`):
             What was measured.
         machine (`dict[str, str]`):
@@ -85,7 +87,7 @@ def to_markdown(sections: Sequence[Section], machine: dict[str, str]) -> str:
     Returns:
         `str`: verdicts first, then each table.
     """
-    parts = ["# Benchmark", ", ".join(f"{name} {value}" for name, value in machine.items())]
+    parts = [f"# {title}", ", ".join(f"{name} {value}" for name, value in machine.items())]
     parts.append("Values are medians with [10th, 90th percentile]; what is compared was measured in turns in one run.")
     targets = [target for section in sections for target in section.targets]
     if targets:
@@ -108,10 +110,12 @@ def to_markdown(sections: Sequence[Section], machine: dict[str, str]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def write_report(sections: Sequence[Section], output_dir: Path) -> None:
-    """Writes `benchmark.md` and `benchmark.json`.
+def write_report(name: str, sections: Sequence[Section], output_dir: Path) -> None:
+    """Writes `<name>.md` and `<name>.json`.
 
     Args:
+        name (`str`):
+            What was measured, in a word.
         sections (`Sequence[Section]`):
             What was measured.
         output_dir (`Path`):
@@ -119,13 +123,13 @@ def write_report(sections: Sequence[Section], output_dir: Path) -> None:
     """
     machine = describe_machine()
     output_dir.mkdir(parents=True, exist_ok=True)
-    (output_dir / "benchmark.md").write_text(to_markdown(sections, machine))
+    (output_dir / f"{name}.md").write_text(to_markdown(f"Benchmark: {name}", sections, machine))
     content = {
         "machine": machine,
         "targets": [{**asdict(target), "verdict": target.verdict} for s in sections for target in s.targets],
         "measurements": {section.title: section.values for section in sections},
     }
-    (output_dir / "benchmark.json").write_text(json.dumps(content, indent=2) + "\n")
+    (output_dir / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n")
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..benchmarks import sections
 from ..benchmarks.acting import measure_acting
-from ..benchmarks.report import Section, describe_machine, to_markdown, write_report
+from ..benchmarks.report import Section, write_report
 from ..benchmarks.update import FAST, REFERENCE, SCAN, measure_update
 from .flags import parse_flags
 
@@ -32,7 +32,7 @@ class BenchmarkConfig:
         quick (`bool`, *optional*, defaults to `False`):
             Only the update and `select_action`, in under 50 s; the last line printed is a JSON object.
         output_dir (`Path`, *optional*, defaults to `outputs/benchmark`):
-            Folder for `benchmark.md` and `benchmark.json`; nothing is written with `quick`.
+            Folder for a `.md` and a `.json` file of each part; nothing is written with `quick`.
         parts (`tuple[str, ...]`, *optional*, defaults to all of them):
             `update`, `acting`, `growth`, `environment` (steps a second) and `pipeline` (a whole `ufrnn demo`).
         seconds (`float`, *optional*, defaults to `60.0`):
@@ -59,14 +59,12 @@ def run(arguments: list[str]) -> None:
     if config.quick:
         print(json.dumps(quick_figures()), flush=True)
         return
-    done: list[Section] = []
     with tempfile.TemporaryDirectory() as folder:
         for name in config.parts:
             print(f"measuring: {name}", flush=True)
-            done += PARTS[name](config.seconds, Path(folder))
-            # After each part, so that a long run that is cut short leaves what it had.
-            write_report(done, config.output_dir)
-    print(to_markdown(done, describe_machine()))
+            sections = PARTS[name](config.seconds, Path(folder))
+            write_report(name, sections, config.output_dir)
+            print((config.output_dir / f"{name}.md").read_text(), flush=True)
 
 
 def quick_figures() -> dict[str, float | None]:

@@ -10,18 +10,15 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
-
 from env_door.latch import KINDS
-from env_door.recording import record
-from env_door.recording_config import RecordConfig
 from env_door.trials import Trial, read_trials
 
 from ..analysis.results import summarize, to_csv, to_markdown
-from ..configuration_ufrnn import CHOICES
 from .flags import parse_flags
-from .foresight import ForesightConfig, draw_trial
 
+# Nothing here imports LeRobot or PyTorch: their memory would lie idle while the stages need it.
+EXPLORATIONS = ("foresight", "noise", "none")
+LAST_CHECKPOINT = Path("checkpoints/last/pretrained_model")
 REPO_ID = "ufrnn/door_demo"
 TRIAL_SEED = 5000
 
@@ -69,8 +66,8 @@ class DemoConfig:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        if self.exploration not in CHOICES["exploration"]:
-            raise ValueError(f"--exploration must be one of {list(CHOICES['exploration'])}, got {self.exploration!r}.")
+        if self.exploration not in EXPLORATIONS:
+            raise ValueError(f"--exploration must be one of {list(EXPLORATIONS)}, got {self.exploration!r}.")
         for name in (
             "episodes_per_kind",
             "autoencoder_steps",
@@ -100,7 +97,7 @@ class DemoConfig:
     @property
     def last_checkpoint(self) -> Path:
         """The newest trained policy."""
-        return self.train_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
+        return self.train_dir / LAST_CHECKPOINT
 
     @property
     def steps(self) -> int:
@@ -131,18 +128,16 @@ def run(arguments: list[str]) -> None:
 
 
 def _record(config: DemoConfig) -> None:
-    recording = RecordConfig(
-        repo_id=REPO_ID,
-        root=config.dataset_dir,
-        episodes_per_kind=config.episodes_per_kind,
-        door_offset=config.door_offset,
-        seed=config.seed,
-        resume=config.dataset_dir.exists(),
-    )
-    _print_command("ufrnn", "record", f"--repo_id={REPO_ID}", f"--root={config.dataset_dir}",
-                   f"--episodes_per_kind={config.episodes_per_kind}", f"--seed={config.seed}")  # fmt: skip
-    report = record(recording)
-    print(f"{report.total_episodes} demonstrations, {len(report.dropped_seeds)} seed(s) dropped")
+    _run([
+        "ufrnn",
+        "record",
+        f"--repo_id={REPO_ID}",
+        f"--root={config.dataset_dir}",
+        f"--episodes_per_kind={config.episodes_per_kind}",
+        f"--door_offset={config.door_offset}",
+        f"--seed={config.seed}",
+        f"--resume={str(config.dataset_dir.exists()).lower()}",
+    ])  # fmt: skip
 
 
 def _train(config: DemoConfig) -> None:
@@ -209,13 +204,13 @@ def _first_of_each_kind(trials: list[Trial], count: int) -> list[Trial]:
 
 def _draw(config: DemoConfig) -> None:
     if config.exploration == "foresight":
-        draw_trial(
-            ForesightConfig(
-                policy_path=str(config.last_checkpoint),
-                output=config.output_dir / "foresight.png",
-                door_offset=config.door_offset,
-            )
-        )
+        _run([
+            "ufrnn",
+            "foresight",
+            f"--policy_path={config.last_checkpoint}",
+            f"--output={config.output_dir / 'foresight.png'}",
+            f"--door_offset={config.door_offset}",
+        ])  # fmt: skip
     _keep_success_videos(config)
     checkpoint = config.output_dir / "checkpoint"
     shutil.rmtree(checkpoint, ignore_errors=True)
@@ -241,19 +236,15 @@ def _trained_steps(config: DemoConfig) -> int:
 
 
 def _run(command: list[str]) -> None:
-    """Runs one of LeRobot's console commands with this interpreter.
+    """Runs a console command of LeRobot or of ours with this interpreter.
 
     Raises:
         RuntimeError: If it fails.
     """
-    _print_command(*command)
-    module = f"lerobot.scripts.{command[0].replace('-', '_')}"
+    print("$ " + shlex.join(command), flush=True)
+    module = "lerobot_ufrnn.commands" if command[0] == "ufrnn" else f"lerobot.scripts.{command[0].replace('-', '_')}"
     result = subprocess.run([sys.executable, "-m", module, *command[1:]], check=False)
     if result.returncode == -2 or result.returncode == 130:
         raise KeyboardInterrupt
     if result.returncode != 0:
         raise RuntimeError(f"{command[0]} failed with exit status {result.returncode}; its message is above.")
-
-
-def _print_command(*words: str) -> None:
-    print("$ " + shlex.join(words), flush=True)

@@ -8,7 +8,7 @@ def test_every_way_is_measured():
     assert [row.name for row in rows] == [
         "physics only",
         "with 128 px picture",
-        "with 128 px picture and 256 px video frame",
+        "with 128 px picture and 192 px video frame",
         "batch of 2, sync",
     ]
     for row in rows:

@@ -16,7 +16,7 @@ from env_door.env import DoorEnv
 env = DoorEnv()
 front = env.reset(seed=0)[0]["pixels"]["front"]
 assert front.shape == (128, 128, 3) and front.std() > 20, front.std()
-assert env.render().shape == (256, 256, 3)
+assert env.render().shape == (192, 192, 3)
 print(type(env._renderer("front")).__name__)
 """
 

@@ -200,13 +200,13 @@ def test_report_has_verdicts_tables_and_numbers(tmp_path):
         Target("short enough", 3.0, 2, at_least=False),
         Target("compared", None, 1, at_least=False),
     )
-    write_report([Section("Speed", ("a", "b"), [["1", "2"]], "A note.", targets, {"a": 1.0})], tmp_path)
-    text = (tmp_path / "benchmark.md").read_text()
+    write_report("speed", [Section("Speed", ("a", "b"), [["1", "2"]], "A note.", targets, {"a": 1.0})], tmp_path)
+    text = (tmp_path / "speed.md").read_text()
     assert "| fast enough | 9 | >= 8 | met |" in text
     assert "| short enough | 3 | <= 2 | not met |" in text
     assert "| compared | - | <= 1 | not measured |" in text
     assert "## Speed\n\nA note.\n\n| a | b |\n| --- | --- |\n| 1 | 2 |" in text
-    content = json.loads((tmp_path / "benchmark.json").read_text())
+    content = json.loads((tmp_path / "speed.json").read_text())
     assert content["measurements"]["Speed"] == {"a": 1.0}
     assert content["targets"][1]["verdict"] == "not met"
 
@@ -256,4 +256,4 @@ def test_a_part_is_measured_and_written(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(benchmark.PARTS, "growth", lambda seconds, folder: [section])
     assert main(["benchmark", "--parts=[growth]", f"--output_dir={tmp_path}"]) == 0
     assert "## Growth" in capsys.readouterr().out
-    assert (tmp_path / "benchmark.json").exists()
+    assert (tmp_path / "growth.json").exists()

@@ -1,7 +1,31 @@
 import json
+import subprocess
+import sys
+from pathlib import Path
+
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
 from env_door.trials import Trial
-from lerobot_ufrnn.commands.demo import DemoConfig, _first_of_each_kind, _keep_success_videos, _trained_steps
+from lerobot_ufrnn.commands.demo import (
+    EXPLORATIONS,
+    LAST_CHECKPOINT,
+    DemoConfig,
+    _first_of_each_kind,
+    _keep_success_videos,
+    _trained_steps,
+)
+from lerobot_ufrnn.configuration_ufrnn import CHOICES
+
+
+def test_what_the_demo_states_without_importing_it_is_true():
+    assert CHOICES["exploration"] == EXPLORATIONS
+    assert Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR) == LAST_CHECKPOINT
+
+
+def test_while_the_stages_run_the_demo_itself_holds_no_pytorch():
+    code = "import sys, lerobot_ufrnn.commands.demo; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
 
 
 def test_surplus_trials_of_the_last_batch_are_not_counted():
