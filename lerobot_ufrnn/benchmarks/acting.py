@@ -126,7 +126,7 @@ def measure_acting(seconds: float = 60.0, min_ticks: int = 1000) -> ActingTimes:
 
 
 def measure_policies(
-    seconds: float = 60.0, min_rounds: int = 10, max_diffusion_rounds: int = 3
+    seconds: float = 60.0, min_rounds: int = 10, max_diffusion_rounds: int = 1
 ) -> dict[str, ActingTimes]:
     """Times all policies on the same observations, cycle by cycle in turns, on one thread.
 
@@ -135,8 +135,8 @@ def measure_policies(
             Time to measure for; Diffusion Policy's comes on top.
         min_rounds (`int`, *optional*, defaults to `10`):
             Cycles of each policy that are measured even if they take longer.
-        max_diffusion_rounds (`int`, *optional*, defaults to `3`):
-            Cycles of Diffusion Policy, which takes up to a minute for each.
+        max_diffusion_rounds (`int`, *optional*, defaults to `1`):
+            Cycles of Diffusion Policy, which takes about a minute for each.
 
     Returns:
         `dict[str, ActingTimes]`: under the names `FAST`, `REFERENCE`, `ACT` and, where it can be imported, `DIFFUSION`.
