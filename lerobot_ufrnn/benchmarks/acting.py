@@ -169,7 +169,7 @@ def _measure(
         # A chunk that the warm-up began is dropped, so that a cycle begins with a computation.
         policy.reset()
 
-    with one_thread():
+    with one_thread(), torch.inference_mode():  # as `lerobot-eval` and `lerobot-rollout` call a policy
         for policy, _ in policies.values():
             policy.reset()
             warm_up(policy, WARM_UP_TICKS)
