@@ -1,6 +1,5 @@
 """How many control steps a second the door environment makes, with and without pictures, alone and in batches."""
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -12,6 +11,8 @@ from numpy.typing import NDArray
 from env_door.configuration_door import DoorEnvConfig
 from env_door.env import DoorEnv
 from env_door.expert import DoorExpert
+
+from .timing import Spread, take_turns
 
 WARM_UP_CALLS = 3
 """Calls of each kind that are not counted: the first one makes renderers and processes."""
@@ -86,7 +87,12 @@ def measure_env(seconds: float = 20.0, batch_size: int = 5, with_async: bool = T
                 batch_size,
                 stack.enter_context(_batch(grasp, batch_size, True)),
             )
-        return _take_turns(ways, seconds)
+        rounds = take_turns({name: call for name, (_, call) in ways.items()}, seconds, warm_up=WARM_UP_CALLS)
+    rows = []
+    for name, (steps, _) in ways.items():
+        rate = Spread.of([steps / duration for duration in rounds.seconds[name]])
+        rows.append(Speed(name, rate.median, rate.low, rate.high, rate.count))
+    return rows
 
 
 def _grasp(env: DoorEnv) -> list[NDArray[np.float32]]:
@@ -116,21 +122,3 @@ def _batch(actions: list[NDArray[np.float32]], batch_size: int, use_async_envs: 
         yield lambda: vector_env.step(last)
     finally:
         vector_env.close()
-
-
-def _take_turns(ways: dict[str, tuple[int, Callable[[], object]]], seconds: float) -> list[Speed]:
-    durations: dict[str, list[float]] = {name: [] for name in ways}
-    for _, call in ways.values():
-        for _ in range(WARM_UP_CALLS):
-            call()
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        for name, (_, call) in ways.items():
-            begin = time.perf_counter()
-            call()
-            durations[name].append(time.perf_counter() - begin)
-    rows = []
-    for name, (steps, _) in ways.items():
-        low, median, high = np.percentile(steps / np.array(durations[name]), (10, 50, 90))
-        rows.append(Speed(name, float(median), float(low), float(high), len(durations[name])))
-    return rows

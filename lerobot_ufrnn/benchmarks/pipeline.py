@@ -64,8 +64,7 @@ def measure_demo(output_dir: Path, flags: Sequence[str] = ()) -> tuple[list[Stag
     """
     if output_dir.exists() and any(output_dir.iterdir()):
         raise ValueError(f"'{output_dir}' is not empty: a demo that is half done already cannot be measured.")
-    program = "import sys; from lerobot_ufrnn.commands import main; sys.exit(main())"
-    command = [sys.executable, "-u", "-c", program, "demo", f"--output_dir={output_dir}", *flags]
+    command = [sys.executable, "-u", "-m", "lerobot_ufrnn.commands", "demo", f"--output_dir={output_dir}", *flags]
     log = output_dir.with_name("demo.log")
     stages = watch(command, log)
     return stages, training_speed(log.read_text().splitlines())

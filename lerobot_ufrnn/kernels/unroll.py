@@ -13,9 +13,11 @@ from torch.autograd.function import once_differentiable
 from ..foresight import Foresight, ForesightTrace
 from ..networks import SHLSTM, HiddenState, Prediction
 from ..recurrent import UFRNN, Memory
+from .layout import GateGradients, Options, Sizes, Steps, TransposedWeights, Weights
 from .matmul import PANEL
 from .packing import Cells, Heads, pack_cells, pack_heads, to_panels
-from .sequence import GateGradients, Options, Sizes, Steps, TransposedWeights, Weights, walk, walk_back
+from .walk import walk
+from .walk_back import walk_back
 
 
 class _Packed(NamedTuple):
@@ -32,13 +34,7 @@ class FastUFRNN(UFRNN):
     whatever that number and the rest of the batch. With weights on another device, weights and inputs visit the CPU for
     the recurrence: it is so small and so sequential that a GPU would spend its time on starting kernels.
 
-    Imagined futures are not kept: `ForesightTrace.futures` is `None`.
-
-    Args:
-        network (`SHLSTM`):
-            The stochastic hierarchical LSTM.
-        foresight (`Foresight`):
-            What happens to the hidden state at each step.
+    Imagined futures are not kept: `ForesightTrace.futures` is `None`. Arguments are those of [`UFRNN`].
     """
 
     def __init__(self, network: SHLSTM, foresight: Foresight):

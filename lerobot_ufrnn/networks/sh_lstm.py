@@ -94,11 +94,7 @@ class SHLSTM(nn.Module):
             `HiddenState`: zeros, (B, hidden size) each.
         """
         weight = self.joint_head.weight
-        joint, image, shared = (
-            weight.new_zeros(batch_size, cell.hidden_size)
-            for cell in (self.joint_cell, self.image_cell, self.shared_cell)
-        )
-        return HiddenState(joint, joint, image, image, shared, shared)
+        return HiddenState(*(weight.new_zeros(batch_size, size) for size in self.state_sizes))
 
     def step(self, inputs: Tensor, state: HiddenState) -> HiddenState:
         """Advances the hidden state by one time step.
