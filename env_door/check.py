@@ -80,7 +80,7 @@ def run_expert(env: DoorEnv, directions: tuple[str, ...], seed: int, offset: flo
         if env.latch.is_open:
             success_step = step
         step += 1
-    if env.latch.attempts != directions:
+    if env.latch.attempts != directions or env.latch.tried_while_held:
         success_step = None
     return Run(success_step, max(free), max(blocked), max(grip))
 
@@ -90,7 +90,7 @@ def expert_table(
 ) -> None:
     """Prints one line of success, time and lag for each sequence of directions and each door offset."""
     for directions, offset in itertools.product(sequences, offsets):
-        name = " > ".join(directions)
+        name = " > ".join(directions) + (f", held {env.hold_seconds:g} s" if env.hold_seconds else "")
         where = f"+-{MAX_OFFSET} m drawn" if offset is None else f"{offset:+.2f} m"
         runs = [run_expert(env, directions, seed, offset) for seed in tqdm(range(seeds), desc=name, leave=False)]
         steps = [run.success_step for run in runs if run.success_step is not None]
@@ -192,6 +192,8 @@ def main() -> None:
     if arguments.wrong_seeds:
         orders = [order for length in (2, 3) for order in itertools.permutations(KINDS, length)]
         expert_table(env, arguments.wrong_seeds, orders, (None,))
+    env.hold_seconds = 3.0
+    expert_table(env, arguments.seeds, [(kind,) for kind in KINDS], (None,))
     env.close()
 
 

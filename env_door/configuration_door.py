@@ -12,7 +12,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from env_door.env import MAX_OFFSET, DoorEnv
+from env_door.env import MAX_HOLD, MAX_OFFSET, DoorEnv
 from env_door.latch import KINDS
 from env_door.scene import ARMS
 from env_door.trials import TrialLog
@@ -46,8 +46,8 @@ class DoorEnvConfig(EnvConfig):
 
     Args:
         task (`str`, *optional*, defaults to `"all"`):
-            Kind of door: `"push"`, `"pull"`, `"slide"`, `"random"` (drawn at each reset), or `"all"`, which
-            evaluates the three kinds one after the other and reports each by itself.
+            Kind of door: `"push"`, `"pull"`, `"slide"` or `"random"` (drawn at each reset). Several kinds, such as
+            `"push,pull"` or `"all"` for the three of them, are evaluated one after the other, each reported by itself.
         fps (`int`, *optional*, defaults to 10):
             Control steps a second. The environment runs at 10 Hz only.
         episode_length (`int`, *optional*, defaults to 300):
@@ -60,6 +60,8 @@ class DoorEnvConfig(EnvConfig):
             Spread of the tool's start position, in metres.
         command_limit (`float`, *optional*, defaults to 0.08):
             Largest distance, in radians, of a joint command from the measured joint.
+        hold_seconds (`float`, *optional*, defaults to 0.0):
+            Time in seconds for which somebody holds the door still once it has begun to open; 0 to 20.
         trial_log (`str | None`, *optional*):
             File that gets one JSON line for every finished trial, see [`~env_door.trials.read_trials`].
 
@@ -75,6 +77,7 @@ class DoorEnvConfig(EnvConfig):
     door_offset: float = 0.0
     start_variation: float = 0.02
     command_limit: float = 0.08
+    hold_seconds: float = 0.0
     trial_log: str | None = None
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
@@ -86,8 +89,10 @@ class DoorEnvConfig(EnvConfig):
     )
 
     def __post_init__(self) -> None:
-        if self.task not in TASKS:
-            raise ParsingError(f"--env.task must be one of {', '.join(TASKS)}, got {self.task!r}.")
+        if self.task not in TASKS and sorted(self.kinds) != sorted(set(self.kinds) & set(KINDS)):
+            raise ParsingError(
+                f"--env.task must be one of {', '.join(TASKS)}, or several kinds such as push,pull, got {self.task!r}."
+            )
         if self.fps != FPS:
             raise ParsingError(f"--env.fps must be {FPS}, the rate of the environment, got {self.fps}.")
         if self.episode_length < 1:
@@ -100,6 +105,8 @@ class DoorEnvConfig(EnvConfig):
             raise ParsingError(f"--env.start_variation must be 0 to 0.05 m, got {self.start_variation}.")
         if not 0.01 <= self.command_limit <= 1.0:
             raise ParsingError(f"--env.command_limit must be 0.01 to 1.0 rad, got {self.command_limit}.")
+        if not 0 <= self.hold_seconds <= MAX_HOLD:
+            raise ParsingError(f"--env.hold_seconds must be 0 to {MAX_HOLD} s, got {self.hold_seconds}.")
         if self.max_parallel_tasks != 1:
             raise ParsingError(
                 f"--env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: drawing does not work in threads. "
@@ -123,6 +130,11 @@ class DoorEnvConfig(EnvConfig):
         return "env_door/Door-v0"
 
     @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of door, one suite each."""
+        return KINDS if self.task == "all" else tuple(kind.strip() for kind in str(self.task).split(","))
+
+    @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Keywords of `gym.make`, but for the kind of the door."""
         return {
@@ -130,6 +142,7 @@ class DoorEnvConfig(EnvConfig):
             "door_offset": self.door_offset,
             "start_variation": self.start_variation,
             "command_limit": self.command_limit,
+            "hold_seconds": self.hold_seconds,
             "observation_size": IMAGE_SIZE,
             "max_episode_steps": self.episode_length,
             "disable_env_checker": self.disable_env_checker,
@@ -150,9 +163,8 @@ class DoorEnvConfig(EnvConfig):
         Returns:
             `dict[str, dict[int, gym.vector.VectorEnv]]`: `{suite: {0: vector environment}}`.
         """
-        kinds = KINDS if self.task == "all" else (self.task,)
         suites: dict[str, dict[int, Any]] = {}
-        for kind in kinds:
+        for kind in self.kinds:
             make = partial(make_door, kind=kind, trial_log=self.trial_log, **self.gym_kwargs)
             if use_async_envs and n_envs > 1:
                 # Imported once by the process that all others fork from, instead of by each of them: half a minute less

@@ -18,6 +18,12 @@ CONTROL_STEPS = 50
 MAX_OFFSET = 0.05
 """Largest sideways shift of the door in metres."""
 
+MAX_HOLD = 20.0
+"""Longest time in seconds for which somebody holds the door."""
+
+HOLD_OPENING = 0.15
+"""Opening, as a fraction of what counts as open, at which somebody holds the door: 60 mrad or 21 mm, seen to move."""
+
 START_DISTANCE = 0.16
 """Distance in metres between the tool and the knob at the nominal start."""
 
@@ -50,6 +56,10 @@ class DoorEnv(gym.Env):
         command_limit (`float`, *optional*, defaults to `0.08`):
             Largest distance in rad between a joint target and the measured joint; keeps a blocked arm from
             folding up.
+        hold_seconds (`float`, *optional*, defaults to `0.0`):
+            Seconds, 0 to 20, for which somebody on the other side holds the door still, once in a trial: from the
+            first control step that leaves it at least 15 % open. Meanwhile `info["held"]` is true, and
+            `info["tried_while_held"]` lists the ways other than its own that are tried. 0 lets the door be.
         observation_size (`int`, *optional*, defaults to `128`):
             Height and width of the observed image in pixels.
         render_size (`int`, *optional*, defaults to `192`):
@@ -69,6 +79,7 @@ class DoorEnv(gym.Env):
         door_offset: float = 0.0,
         start_variation: float = 0.02,
         command_limit: float = 0.08,
+        hold_seconds: float = 0.0,
         observation_size: int = 128,
         render_size: int = 192,
         render_mode: str = "rgb_array",
@@ -79,6 +90,7 @@ class DoorEnv(gym.Env):
         _check_range("door_offset", door_offset, 0.0, MAX_OFFSET, "m")
         _check_range("start_variation", start_variation, 0.0, 0.05, "m")
         _check_range("command_limit", command_limit, 0.01, 1.0, "rad")
+        _check_range("hold_seconds", hold_seconds, 0.0, MAX_HOLD, "s")
         _check_range("observation_size", observation_size, 16, 768, "pixels")
         _check_range("render_size", render_size, 16, 768, "pixels")
         if render_mode not in self.metadata["render_modes"]:
@@ -88,6 +100,7 @@ class DoorEnv(gym.Env):
         self.door_offset = door_offset
         self.start_variation = start_variation
         self.command_limit = command_limit
+        self.hold_seconds = hold_seconds
         self.observation_size = int(observation_size)
         self.render_size = int(render_size)
         self.render_mode = render_mode
@@ -112,6 +125,7 @@ class DoorEnv(gym.Env):
         self._doorway = int(self.model.body("doorway").id)
         self._doorway_home = self.model.body_pos[self._doorway].copy()
         self._target: NDArray[np.float64] = np.zeros(len(self.joint_names))
+        self._to_be_held = False
         self._renderers: dict[str, Renderer] = {}
         self._picture: NDArray[np.uint8] | None = None
         self._picture_poses: NDArray[np.float64] = np.empty(0)
@@ -155,6 +169,7 @@ class DoorEnv(gym.Env):
 
         mujoco.mj_resetData(self.model, self.data)
         self.latch.reset(drawn_kind if kind == "random" else kind)
+        self._to_be_held = self.hold_seconds > 0
         self.current_offset = float(offset)
         self.model.body_pos[self._doorway] = self._doorway_home + np.array([0.0, self.current_offset, 0.0])
         start = self._doorway_home + self.model.site("knob").pos + np.array([-START_DISTANCE, 0.0, 0.0]) + start_shift
@@ -202,6 +217,9 @@ class DoorEnv(gym.Env):
             mujoco.mj_step(self.model, self.data)
             self.latch.update()
         self._target = target
+        if self._to_be_held and self.latch.opening >= HOLD_OPENING:
+            self._to_be_held = False
+            self.hold_door(self.hold_seconds)
         self._check_physics()
 
     def limit_action(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -296,6 +314,8 @@ class DoorEnv(gym.Env):
             "door_kind": self.latch.kind,
             "opening": self.latch.opening,
             "attempts": self.latch.attempts,
+            "held": self.latch.held,
+            "tried_while_held": self.latch.tried_while_held,
         }
 
     def _renderer(self, camera: str) -> Renderer:

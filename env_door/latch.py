@@ -96,6 +96,7 @@ class Latch:
         self.kind = kind
         self.freed = False
         self.attempts: tuple[str, ...] = ()
+        self.tried_while_held: tuple[str, ...] = ()
         self._loaded_steps = dict.fromkeys(KINDS, 0)
         self._held_steps = 0
         for joint, index in self._joint.items():
@@ -126,6 +127,11 @@ class Latch:
         speed = abs(float(self._data.qvel[self._qvel[opening.joint]]))
         return self.opening >= 1.0 and speed <= opening.still_speed
 
+    @property
+    def held(self) -> bool:
+        """`bool`: whether somebody holds the panel where it is."""
+        return self._held_steps > 0
+
     def load(self, direction: str) -> float:
         """Load with which the robot works on a lock, as a fraction of the load that would free such a door.
 
@@ -148,9 +154,12 @@ class Latch:
     def hold(self, num_steps: int) -> None:
         """Holds the panel where it is: interference by a person at the other side of the door.
 
+        `attempts` stays the directions in which the shut door was tried. The ways other than its own in which a freed
+        door is loaded meanwhile, as strongly and as long as a try, go to `tried_while_held`.
+
         Args:
             num_steps (`int`):
-                Physics steps for which to hold it; replaces a hold that still lasts.
+                Physics steps for which to hold it; replaces a hold that still lasts, 0 ends it.
 
         Raises:
             ValueError: If the number is negative.
@@ -158,22 +167,35 @@ class Latch:
         if num_steps < 0:
             raise ValueError(f"num_steps={num_steps} must not be negative")
         self._held_steps = num_steps
-        if self.freed and num_steps > 0:
+        if self.freed:
             joint = OPENINGS[self.kind].joint
-            self._lock_at(joint, float(self._data.qpos[self._qpos[joint]]))
+            if num_steps > 0:
+                self._lock_at(joint, float(self._data.qpos[self._qpos[joint]]))
+            else:
+                self._unlock(joint)
 
     def update(self) -> None:
         """Looks at the loads after one physics step; frees the door when it is loaded its own way."""
-        held = self._held_steps > 0
+        held = self.held
         if held:
             self._held_steps -= 1
-        if self.freed:
-            if held and self._held_steps == 0:
-                self._data.eq_active[self._lock[OPENINGS[self.kind].joint]] = 0
-            return
-        if not self.unlatched:
+        # Only a shut or held panel resists in every direction; while the latch is in, loads are no tries.
+        if not (held if self.freed else self.unlatched):
             self._loaded_steps = dict.fromkeys(KINDS, 0)
             return
+        tried = self._tried()
+        if self.freed:
+            if tried is not None and tried != self.kind:
+                self.tried_while_held = _with(self.tried_while_held, tried)
+            if not self.held:
+                self._unlock(OPENINGS[self.kind].joint)
+        elif tried is not None:
+            self.attempts = _with(self.attempts, tried)
+            if tried == self.kind and not held:
+                self._free()
+
+    def _tried(self) -> str | None:
+        """The direction in which the panel has been loaded past the threshold for long enough, if there is one."""
         loads = {direction: self.load(direction) for direction in KINDS}
         # A sideways load on the knob also turns the hinge a little: the strongest load tells what is being
         # tried.
@@ -181,19 +203,12 @@ class Latch:
         for direction in KINDS:
             tried = direction == strongest and loads[direction] >= 1.0
             self._loaded_steps[direction] = self._loaded_steps[direction] + 1 if tried else 0
-        if self._loaded_steps[strongest] >= LOAD_STEPS:
-            self._record(strongest)
-            if strongest == self.kind and not held:
-                self._free()
-
-    def _record(self, direction: str) -> None:
-        if not self.attempts or self.attempts[-1] != direction:
-            self.attempts += (direction,)
+        return strongest if self._loaded_steps[strongest] >= LOAD_STEPS else None
 
     def _free(self) -> None:
         opening = OPENINGS[self.kind]
         self.freed = True
-        self._data.eq_active[self._lock[opening.joint]] = 0
+        self._unlock(opening.joint)
         limits = (0.0, opening.limit) if opening.sign > 0 else (-opening.limit, 0.0)
         self._model.jnt_range[self._joint[opening.joint]] = limits
 
@@ -201,3 +216,10 @@ class Latch:
         equality = self._lock[joint]
         self._model.eq_data[equality, 0] = position
         self._data.eq_active[equality] = 1
+
+    def _unlock(self, joint: str) -> None:
+        self._data.eq_active[self._lock[joint]] = 0
+
+
+def _with(directions: tuple[str, ...], direction: str) -> tuple[str, ...]:
+    return directions if directions[-1:] == (direction,) else (*directions, direction)

@@ -14,6 +14,8 @@ import draccus
 import gymnasium as gym
 from draccus.utils import ParsingError
 
+from env_door.latch import KINDS
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -34,6 +36,10 @@ class Trial:
             How far the door stood open at the end, 0 closed, 1 the success threshold.
         door_offset (`float`):
             Lateral shift of the door in metres.
+        held_at (`int | None`, *optional*):
+            First control step, counted from 0, during which somebody held the door; `None` if nobody did.
+        tried_while_held (`tuple[str, ...]`, *optional*, defaults to `()`):
+            Directions other than the door's own in which the opened door was tried while it was held, in order.
     """
 
     seed: int | None
@@ -43,6 +49,8 @@ class Trial:
     attempts: tuple[str, ...]
     opening: float
     door_offset: float
+    held_at: int | None = None
+    tried_while_held: tuple[str, ...] = ()
 
     @property
     def first_try_wrong(self) -> bool:
@@ -58,6 +66,11 @@ class Trial:
     def recovered(self) -> bool:
         """Whether the door was opened after at least one wrong attempt."""
         return self.success and self._tried_wrongly
+
+    @property
+    def opened_after_hold(self) -> bool:
+        """Whether the door was opened although it had been held."""
+        return self.success and self.held_at is not None
 
     @property
     def _tried_wrongly(self) -> bool:
@@ -83,17 +96,20 @@ class TrialLog(gym.Wrapper):
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._seed: int | None = None
         self._steps = 0
+        self._held_at: int | None = None
         self._finished = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Start a new trial; an unfinished one is forgotten."""
-        self._seed, self._steps, self._finished = seed, 0, False
+        self._seed, self._steps, self._held_at, self._finished = seed, 0, None, False
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action):
         """Step the environment and log the trial when this step ends it."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps += 1
+        if info["held"] and self._held_at is None:
+            self._held_at = self._steps
         if (terminated or truncated) and not self._finished:
             self._finished = True
             self._append(info)
@@ -108,6 +124,8 @@ class TrialLog(gym.Wrapper):
             attempts=tuple(info["attempts"]),
             opening=float(info["opening"]),
             door_offset=float(self.get_wrapper_attr("current_offset")),
+            held_at=self._held_at,
+            tried_while_held=tuple(info["tried_while_held"]),
         )
         line = json.dumps(asdict(trial)) + "\n"
         descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -152,3 +170,22 @@ def read_trials(path: str | Path) -> list[Trial]:
             seen.add((trial.door_kind, trial.seed))
         trials.append(trial)
     return trials
+
+
+def first_of_each_kind(trials: list[Trial], count: int) -> list[Trial]:
+    """Keep the trials that `lerobot-eval` counts: it fills its last batch with a few more.
+
+    Args:
+        trials (`list[Trial]`):
+            Trials of one evaluation, in any order.
+        count (`int`):
+            How many to keep of each kind.
+
+    Returns:
+        `list[Trial]`: Those with the lowest seeds, kind by kind.
+    """
+    kept = []
+    for kind in KINDS:
+        of_kind = sorted((trial for trial in trials if trial.door_kind == kind), key=lambda trial: trial.seed or 0)
+        kept += of_kind[:count]
+    return kept

@@ -68,6 +68,10 @@ def test_policy_features(arm, dimension):
     [
         ("task", "open", "push, pull, slide, random, all"),
         ("task", None, "push, pull, slide, random, all"),
+        ("task", "", "or several kinds such as push,pull"),
+        ("task", "push,lift", "or several kinds such as push,pull"),
+        ("task", "push,push", "or several kinds such as push,pull"),
+        ("task", "push,random", "or several kinds such as push,pull"),
         ("fps", 30, "must be 10"),
         ("episode_length", 0, "at least 1"),
         ("arm", "ur10", "ur5e, panda"),
@@ -77,6 +81,8 @@ def test_policy_features(arm, dimension):
         ("start_variation", 0.06, "0 to 0.05"),
         ("command_limit", 0.0, "0.01 to 1.0"),
         ("command_limit", 1.1, "0.01 to 1.0"),
+        ("hold_seconds", -0.1, "0 to 20.0 s"),
+        ("hold_seconds", 20.1, "0 to 20.0 s"),
         ("max_parallel_tasks", 2, "must be 1"),
     ],
 )
@@ -86,7 +92,14 @@ def test_bad_fields_are_refused(field, value, allowed):
 
 
 @pytest.mark.parametrize(
-    "field_value", [("door_offset", 0.05), ("start_variation", 0.05), ("command_limit", 1.0), ("command_limit", 0.01)]
+    "field_value",
+    [
+        ("door_offset", 0.05),
+        ("start_variation", 0.05),
+        ("command_limit", 1.0),
+        ("command_limit", 0.01),
+        ("hold_seconds", 20.0),
+    ],
 )
 def test_the_environment_takes_the_extremes_that_the_configuration_allows(field_value):
     field, value = field_value
@@ -94,10 +107,13 @@ def test_the_environment_takes_the_extremes_that_the_configuration_allows(field_
     assert getattr(DoorEnv(**{field: getattr(config, field)}), field) == value
 
 
-def test_all_makes_one_suite_a_kind():
-    suites = make_env(DoorEnvConfig(task="all"), n_envs=1)
+@pytest.mark.parametrize(
+    ("task", "wanted"), [("all", ["push", "pull", "slide"]), ("pull, push", ["pull", "push"]), ("slide", ["slide"])]
+)
+def test_each_kind_has_a_suite_of_its_own(task, wanted):
+    suites = make_env(DoorEnvConfig(task=task), n_envs=1)
     kinds = {name: tasks[0].reset(seed=0)[1]["door_kind"][0] for name, tasks in suites.items()}
-    assert kinds == {"door_push": "push", "door_pull": "pull", "door_slide": "slide"}
+    assert list(kinds.items()) == [(f"door_{kind}", kind) for kind in wanted]
     for tasks in suites.values():
         tasks[0].close()
 
@@ -153,6 +169,20 @@ def test_rollout_of_lerobot_eval_sees_success_and_failure(tmp_path):
     assert {trial.door_kind for trial in trials} == {"pull"}
     # The steps of the log are those at which the roll-out was done.
     assert [int(done.int().argmax()) + 1 for done in result["done"]] == [trial.steps for trial in trials]
+
+
+def test_rollout_of_lerobot_eval_logs_the_hold(tmp_path):
+    """One trial is held and opened, the other never begins to open: their infos must go into one batch."""
+    log = tmp_path / "trials.jsonl"
+    config = DoorEnvConfig(task="push", episode_length=120, hold_seconds=3.0, trial_log=str(log))
+    (tasks,) = make_env(config, n_envs=2).values()
+    run(tasks[0], [("push",)], seeds=[7, 8])
+    tasks[0].close()
+    opened, untouched = sorted(read_trials(log), key=lambda trial: trial.seed)
+    assert opened.opened_after_hold
+    assert 65 <= opened.held_at <= 75
+    assert opened.held_at + 30 < opened.steps
+    assert (untouched.held_at, untouched.tried_while_held, untouched.opened_after_hold) == (None, (), False)
 
 
 @pytest.mark.slow

@@ -4,8 +4,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import env_door
-from env_door.env import DoorEnv
-from env_door.expert import DoorExpert
+from env_door.env import HOLD_OPENING, DoorEnv
+from env_door.expert import GRASP_CLOSURE, DoorExpert
 from env_door.latch import OPENINGS
 
 
@@ -151,6 +151,8 @@ def test_bad_actions_are_refused(env, action):
         ({"door_offset": 0.06}, "door_offset=0.06"),
         ({"door_offset": float("nan")}, "door_offset=nan"),
         ({"command_limit": 0.0}, "command_limit=0.0"),
+        ({"hold_seconds": -1.0}, "hold_seconds=-1.0"),
+        ({"hold_seconds": 21.0}, "hold_seconds=21.0 is out of range; it must lie within 0.0 to 20.0 s"),
         ({"render_mode": "human"}, "render_mode='human'"),
         ({"observation_size": 4}, "observation_size=4"),
     ],
@@ -225,6 +227,59 @@ def test_held_door_stops_and_then_opens(env):
     for _ in range(60):
         *_, info = env.step(expert.act())
     assert info["is_success"]
+
+
+@pytest.mark.parametrize("kind", env_door.KINDS)
+def test_a_door_is_held_once_it_has_begun_to_open(env, kind):
+    """Whoever goes on as before opens it once it is let go; until it is held, nothing differs from any other trial."""
+    holding = DoorEnv(door_offset=0.05, hold_seconds=3.0)
+    trace = play(holding, kind, 0, directions=(kind,), num_steps=130)
+    holding.close()
+    infos = [info for _, _, info in trace]
+    held = [step for step, info in enumerate(infos) if info["held"]]
+    assert held == list(range(held[0], held[0] + 30))
+    assert HOLD_OPENING <= infos[held[0]]["opening"] < HOLD_OPENING + 0.1
+    assert infos[held[0] - 1]["opening"] < HOLD_OPENING
+    openings = [info["opening"] for info in infos[held[0] : held[-1] + 2]]
+    assert np.ptp(openings) < 0.005
+    assert not any(info["is_success"] for info in infos[: held[-1] + 2])
+    assert infos[held[-1] + 5]["opening"] > openings[-1] + 0.1
+    assert infos[-1]["is_success"]
+    assert infos[-1]["attempts"] == (kind,)
+    assert infos[-1]["tried_while_held"] == ()
+
+    undisturbed = play(env, kind, 0, directions=(kind,), num_steps=held[0])
+    assert_identical(undisturbed, trace[: held[0] + 1])
+    assert not any(info["held"] for _, _, info in undisturbed)
+
+
+def test_a_push_at_a_held_pull_door_is_noted_and_the_door_opens_after_it():
+    env = DoorEnv(hold_seconds=3.0)
+    _, info = env.reset(seed=0, options={"kind": "pull"})
+    expert = DoorExpert(env, ("pull",))
+    expert.reset(np.random.default_rng(0))
+    while not info["held"]:
+        *_, info = env.step(expert.act())
+    joints = env.measured_joints()
+    position, rotation = env.kinematics.forward(joints[:-1])
+    pushed = env.kinematics.solve(position + np.array([0.04, 0.0, 0.0]), rotation, joints[:-1])
+    for _ in range(10):
+        *_, info = env.step(np.append(pushed, GRASP_CLOSURE))
+    assert info["held"]
+    assert (info["attempts"], info["tried_while_held"]) == (("pull",), ("push",))
+    for _ in range(60):
+        *_, info = env.step(expert.act())
+    env.close()
+    assert info["is_success"]
+    assert info["tried_while_held"] == ("push",)
+
+
+def test_every_trial_has_its_hold():
+    env = DoorEnv(hold_seconds=0.5)
+    for _ in range(2):
+        trace = play(env, "push", 0, num_steps=85)
+        assert sum(info["held"] for _, _, info in trace) == 5
+    env.close()
 
 
 def test_picture_is_drawn_only_when_something_moved(env, monkeypatch):

@@ -40,6 +40,23 @@ def test_opens_every_kind_at_every_offset(env, kind, offset):
         assert env.latch.attempts == (kind,)
 
 
+@pytest.mark.parametrize("offset", [-0.05, 0.05])
+@pytest.mark.parametrize("kind", ["push", "pull"])
+def test_hinged_doors_open_within_a_hundred_steps_at_the_slowest_timing(env, kind, offset):
+    """So that demonstrations of 100 steps, as the paper recorded with the real robot, drop no seed."""
+
+    class Slowest:
+        def integers(self, low, high):
+            return high - 1
+
+    env.reset(seed=0, options={"kind": kind, "door_offset": offset})
+    expert = DoorExpert(env, (kind,))
+    expert.reset(Slowest())
+    for _ in range(99):
+        env.advance(expert.act())
+    assert env.latch.is_open
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_panda_opens_every_kind(kind):
     env = DoorEnv(arm="panda", door_offset=0.05)

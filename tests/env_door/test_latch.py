@@ -98,6 +98,50 @@ def test_held_door_is_not_freed_until_let_go(model):
     assert latch.freed
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_held_open_door_stays_and_notes_the_other_ways_that_are_tried(model, kind):
+    data, latch = fresh(model, kind)
+    press(model, data, latch, kind, 1.2 * OPENINGS[kind].break_load, steps=LOAD_STEPS + 60)
+    latch.hold(2000)
+    held_at = latch.travel
+    assert held_at > 0.002
+    others = [direction for direction in KINDS if direction != kind]
+    for direction in (kind, *others, kind, others[1]):
+        press(model, data, latch, direction, 1.5 * OPENINGS[direction].break_load)
+        press(model, data, latch, direction, 0.0, steps=50)
+    assert latch.held
+    assert latch.travel == pytest.approx(held_at, abs=2e-3)
+    assert latch.tried_while_held == tuple(others)
+    assert latch.attempts == (kind,), "those of the shut door"
+    latch.reset(kind)
+    assert (latch.held, latch.tried_while_held) == (False, ())
+
+
+def test_weak_or_short_loads_on_a_held_door_are_no_tries(model):
+    data, latch = fresh(model, "pull")
+    press(model, data, latch, "pull", 12.0)
+    latch.hold(2000)
+    press(model, data, latch, "push", 0.8 * OPENINGS["push"].break_load)
+    press(model, data, latch, "slide", 2 * OPENINGS["slide"].break_load, steps=LOAD_STEPS - 10)
+    press(model, data, latch, "push", 0.0, steps=50)
+    assert latch.tried_while_held == ()
+
+
+@pytest.mark.parametrize("end", [lambda latch: latch.hold(1), lambda latch: latch.hold(0)])
+def test_a_held_door_moves_on_once_let_go(model, end):
+    data, latch = fresh(model, "slide")
+    press(model, data, latch, "slide", 20.0)
+    latch.hold(500)
+    press(model, data, latch, "slide", 20.0, steps=100)
+    held_at = latch.travel
+    end(latch)
+    press(model, data, latch, "slide", 20.0, steps=100)
+    assert not latch.held
+    assert latch.travel > held_at + 0.01
+    press(model, data, latch, "push", 30.0)
+    assert latch.tried_while_held == (), "nobody holds it any more"
+
+
 def test_open_means_far_enough_and_nearly_still(model):
     data, latch = fresh(model, "push")
     press(model, data, latch, "push", 25.0, steps=LOAD_STEPS + 10)
