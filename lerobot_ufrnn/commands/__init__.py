@@ -11,6 +11,11 @@ COMMANDS = {
     "record": "record demonstrations of the scripted expert into a LeRobotDataset",
     "results": "turn the trial log of lerobot-eval into a table per door",
     "foresight": "draw what foresight imagines where the policy has to choose",
+    "protocol": "train and evaluate models x seeds x checkpoints, resumably; table of all results",
+    "curve": "draw the success rate over the epochs of training from that table",
+    "hidden": "draw hidden states along the demonstrations and in a trial, model by model",
+    "lyapunov": "draw how chaotic the imagined futures are along the demonstrations",
+    "report": "put all results, tables, pictures and videos into one page",
     "benchmark": "time it against the readable code, XLA, ACT and Diffusion Policy",
 }
 

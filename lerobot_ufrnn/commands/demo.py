@@ -10,10 +10,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from env_door.latch import KINDS
-from env_door.trials import Trial, read_trials
+from env_door.trials import first_of_each_kind, read_trials
 
 from ..analysis.results import summarize, to_csv, to_markdown
+from ..experiments.processes import with_this_python
 from .flags import parse_flags
 
 # Nothing here imports LeRobot or PyTorch: their memory would lie idle while the stages need it.
@@ -188,18 +188,9 @@ def _evaluate(config: DemoConfig) -> None:
             f"--seed={TRIAL_SEED}",
         ])  # fmt: skip
     trials = read_trials(config.eval_dir / "trials.jsonl")
-    rows = summarize(_first_of_each_kind(trials, config.trials_per_kind))
+    rows = summarize(first_of_each_kind(trials, config.trials_per_kind))
     (config.output_dir / "results.md").write_text(to_markdown(rows))
     (config.output_dir / "results.csv").write_text(to_csv(rows))
-
-
-def _first_of_each_kind(trials: list[Trial], count: int) -> list[Trial]:
-    """The trials that lerobot-eval counts: it fills its last batch with a few more."""
-    kept = []
-    for kind in KINDS:
-        of_kind = sorted((trial for trial in trials if trial.door_kind == kind), key=lambda trial: trial.seed or 0)
-        kept += of_kind[:count]
-    return kept
 
 
 def _draw(config: DemoConfig) -> None:
@@ -242,8 +233,7 @@ def _run(command: list[str]) -> None:
         RuntimeError: If it fails.
     """
     print("$ " + shlex.join(command), flush=True)
-    module = "lerobot_ufrnn.commands" if command[0] == "ufrnn" else f"lerobot.scripts.{command[0].replace('-', '_')}"
-    result = subprocess.run([sys.executable, "-m", module, *command[1:]], check=False)
+    result = subprocess.run(with_this_python(command), check=False)
     if result.returncode == -2 or result.returncode == 130:
         raise KeyboardInterrupt
     if result.returncode != 0:

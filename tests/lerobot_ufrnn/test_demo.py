@@ -5,12 +5,10 @@ from pathlib import Path
 
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
-from env_door.trials import Trial
 from lerobot_ufrnn.commands.demo import (
     EXPLORATIONS,
     LAST_CHECKPOINT,
     DemoConfig,
-    _first_of_each_kind,
     _keep_success_videos,
     _trained_steps,
 )
@@ -26,13 +24,6 @@ def test_while_the_stages_run_the_demo_itself_holds_no_pytorch():
     code = "import sys, lerobot_ufrnn.commands.demo; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
-
-
-def test_surplus_trials_of_the_last_batch_are_not_counted():
-    """lerobot-eval runs full batches and reports the first seeds; the log has all of them, in order of ending."""
-    trials = [Trial(seed, kind, True, 9, (kind,), 1.0, 0.0) for kind in ("slide", "push") for seed in (7, 5, 6)]
-    kept = _first_of_each_kind(trials, 2)
-    assert [(trial.door_kind, trial.seed) for trial in kept] == [("push", 5), ("push", 6), ("slide", 5), ("slide", 6)]
 
 
 def test_only_videos_of_opened_doors_are_kept(tmp_path):

@@ -1,11 +1,12 @@
 import csv
 import math
+from dataclasses import replace
 from io import StringIO
 
 import pytest
 
 from env_door.trials import Trial
-from lerobot_ufrnn.analysis.results import summarize, to_csv, to_markdown, wilson_interval
+from lerobot_ufrnn.analysis.results import newcombe_interval, summarize, to_csv, to_markdown, wilson_interval
 
 
 def trial(kind: str, success: bool, steps: int, *attempts: str) -> Trial:
@@ -20,6 +21,22 @@ TRIALS = [
     trial("push", False, 300),
     trial("slide", True, 100, "slide"),
 ]
+
+
+HELD_TRIALS = [
+    replace(TRIALS[0], held_at=70, tried_while_held=("pull", "slide")),
+    replace(TRIALS[3], held_at=70, attempts=("pull", "push")),
+    replace(TRIALS[5], held_at=70),
+]
+
+
+def test_held_doors_are_counted_apart():
+    push, slide, overall = summarize([*TRIALS[:2], *HELD_TRIALS])
+    assert (push.trials, push.opened_300, push.held, push.opened_after_hold, push.tried_another_way) == (4, 3, 2, 1, 1)
+    assert (slide.held, slide.opened_after_hold, slide.tried_another_way) == (1, 1, 0)
+    assert (overall.held, overall.opened_after_hold, overall.tried_another_way) == (3, 2, 1)
+    assert "| all | 3/5 = 60% [23%, 88%] | 2/3 = 67% [21%, 94%] | 1/3 = 33% [6%, 79%] |\n" in to_markdown([overall])
+    assert "held" not in to_markdown(summarize(TRIALS))
 
 
 def test_counts_keep_first_tries_and_recoveries_apart():
@@ -39,6 +56,29 @@ def test_wilson_interval_is_its_closed_form(successes, trials):
     low, high = wilson_interval(successes, trials)
     assert low == pytest.approx(max(0, centre - half), abs=1e-9)
     assert high == pytest.approx(min(1, centre + half), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("counts", "interval"),
+    [
+        ((56, 70, 48, 80), (0.0524, 0.3339)),
+        ((9, 10, 3, 10), (0.1705, 0.8090)),
+        ((6, 7, 2, 7), (0.0582, 0.8062)),
+        ((5, 56, 0, 29), (-0.0381, 0.1926)),
+        ((0, 10, 0, 20), (-0.1611, 0.2775)),
+        ((0, 10, 0, 10), (-0.2775, 0.2775)),
+        ((10, 10, 0, 20), (0.6791, 1.0)),
+        ((10, 10, 0, 10), (0.6075, 1.0)),
+    ],
+)
+def test_newcombe_interval_is_that_of_the_paper(counts, interval):
+    """Newcombe (1998), Table II, method 10."""
+    assert newcombe_interval(*counts) == pytest.approx(interval, abs=5e-5)
+
+
+def test_a_wrong_try_after_the_right_one_is_no_recovery():
+    overall = summarize([trial("push", True, 90, "push", "pull", "push")])[-1]
+    assert (overall.opened_300, overall.first_try, overall.first_try_wrong, overall.recovered) == (1, 0, 0, 0)
 
 
 def test_the_tables_say_the_same_to_people_and_to_programs():
