@@ -1,0 +1,218 @@
+"""A picture of hidden states on their plane: demonstrations dotted, a trial solid (UF-RNN, Figs. 5 and 7)."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ..networks import HiddenState
+from .colors import DOOR_COLORS
+from .hidden_states import Plane, stack_states
+from .trial import Attempt, TrialHistory
+
+OTHER_COLOR = "#999999"
+HELD_COLOR = "#ffcc33"
+PANELS_PER_ROW = 3
+DOT_SPACING = 4.5
+"""From dot to dot of a dotted line, in line widths."""
+
+
+@dataclass(frozen=True)
+class HiddenPaths:
+    """`h_shared` of one model on the plane of its demonstrations.
+
+    Attributes:
+        label (`str`): name of the model.
+        kinds (`list[str]`): kind of each demonstration.
+        demonstrations (`list[np.ndarray]`): path of each, (L, 2).
+        trial (`np.ndarray`): path of the trial, (L, 2).
+        shares (`tuple[float, float]`): share of the demonstrations' variance along each axis.
+        door_kind (`str`): kind of the trial's door.
+        attempts (`list[Attempt]`): directions tried in the trial.
+        held (`list[int]`): steps of the trial at which somebody held the door.
+        success (`bool`): whether the trial's door was opened.
+    """
+
+    label: str
+    kinds: list[str]
+    demonstrations: list[np.ndarray]
+    trial: np.ndarray
+    shares: tuple[float, float]
+    door_kind: str
+    attempts: list[Attempt]
+    held: list[int]
+    success: bool
+
+    @classmethod
+    def of(cls, label: str, kinds: list[str], states: Sequence[HiddenState], history: TrialHistory) -> "HiddenPaths":
+        """Fits the plane to demonstrations and puts them and a trial on it.
+
+        Args:
+            label (`str`):
+                Name of the model.
+            kinds (`list[str]`):
+                Kind of each demonstration.
+            states (`Sequence[HiddenState]`):
+                States along each, (L, hidden size) each.
+            history (`TrialHistory`):
+                The trial.
+
+        Returns:
+            `HiddenPaths`: the paths.
+        """
+        plane = Plane.fit(torch.cat([of_episode.h_shared for of_episode in states]))
+        first, second = plane.shares.tolist()
+        return cls(
+            label,
+            kinds,
+            [plane.project(of_episode.h_shared).cpu().numpy() for of_episode in states],
+            plane.project(stack_states(history.states).h_shared[:, 0]).cpu().numpy(),
+            (first, second),
+            history.door_kind,
+            history.attempts,
+            history.held,
+            history.success,
+        )
+
+
+def draw(models: Sequence[HiddenPaths], path: Path) -> None:
+    """Draws a panel a model and writes them to `path`.
+
+    Each demonstration is a pale line, the mean of each kind a dotted one. The trial is the black line; what it tries
+    shows in the colour of that kind, and the time for which somebody held the door is highlighted.
+
+    Args:
+        models (`Sequence[HiddenPaths]`):
+            The models.
+        path (`Path`):
+            Where to write the picture; its ending chooses the format.
+    """
+    num_columns = min(len(models), PANELS_PER_ROW)
+    num_rows = -(-len(models) // num_columns)
+    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(3.4 * num_columns, 0.6 + 3.2 * num_rows), layout="constrained")
+        panels = figure.subplots(num_rows, num_columns, squeeze=False).flatten()
+        for panel, model in zip(panels, models, strict=False):
+            _draw_model(panel, model)
+        for panel in panels[len(models) :]:
+            panel.set_visible(False)
+        kinds = dict.fromkeys(kind for model in models for kind in (*model.kinds, *_directions(model)))
+        figure.legend(
+            handles=_legend(list(kinds), with_held=any(model.held for model in models)),
+            loc="outside lower center",
+            ncols=min(4, 2 * num_columns),
+            frameon=False,
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=150)
+
+
+def _draw_model(panel: Axes, model: HiddenPaths) -> None:
+    kinds = list(dict.fromkeys(model.kinds))
+    for number, kind in enumerate(kinds):
+        color = DOOR_COLORS.get(kind, OTHER_COLOR)
+        paths = [path for path, of_kind in zip(model.demonstrations, model.kinds, strict=True) if of_kind == kind]
+        for path in paths:
+            panel.plot(*path.T, color=color, linewidth=0.5, alpha=0.2)
+        shortest = min(map(len, paths))
+        mean = np.mean([path[:shortest] for path in paths], axis=0)
+        # Dots of one kind fall between those of the others where their paths agree.
+        dots = (DOT_SPACING * number / len(kinds), (1, DOT_SPACING - 1))
+        panel.plot(*mean.T, color=color, linestyle=dots, linewidth=2)
+    if model.held:
+        panel.plot(*model.trial[model.held].T, color=HELD_COLOR, linewidth=6, alpha=0.6, solid_capstyle="round")
+    panel.plot(*model.trial.T, color="black", linewidth=0.8)
+    panel.plot(*model.trial[0], "k.", markersize=8)
+    for number, (step, direction) in enumerate(model.attempts):
+        panel.plot(
+            *model.trial[step],
+            marker="o" if number == 0 else "s",
+            markersize=9 if number == 0 else 5,
+            markerfacecolor=DOOR_COLORS.get(direction, OTHER_COLOR),
+            markeredgecolor="black",
+        )
+    if model.success:
+        panel.plot(*model.trial[-1], marker="*", markersize=13, markerfacecolor="white", markeredgecolor="black")
+    if model.attempts:
+        _annotate_first_try(panel, model)
+    result = f"opened at step {len(model.trial) - 1}" if model.success else "not opened"
+    panel.set_title(f"{model.label}\n{model.door_kind} door, {result}", fontsize=9)
+    first, second = model.shares
+    panel.set(xlabel=f"PC 1 ({first:.0%})", ylabel=f"PC 2 ({second:.0%})")
+
+
+def _annotate_first_try(panel: Axes, model: HiddenPaths) -> None:
+    """Writes direction and step of the first try into the corner with the fewest points."""
+    step, direction = model.attempts[0]
+    points = panel.transAxes.inverted().transform(
+        panel.transData.transform(np.concatenate([*model.demonstrations, model.trial]))
+    )
+    corners = [(x, y) for x in (0, 1) for y in (0, 1)]
+    corner = min(corners, key=lambda corner: np.sum((np.abs(points - corner) < (0.4, 0.2)).all(axis=1)))
+    panel.annotate(
+        f"first try: {direction},\nstep {step}",
+        model.trial[step],
+        xytext=(0.02 + 0.96 * corner[0], 0.02 + 0.96 * corner[1]),
+        textcoords="axes fraction",
+        ha=("left", "right")[corner[0]],
+        va=("bottom", "top")[corner[1]],
+        fontsize=8,
+        arrowprops={"arrowstyle": "-", "linewidth": 0.6},
+    )
+
+
+def _directions(model: HiddenPaths) -> list[str]:
+    return [direction for _, direction in model.attempts]
+
+
+def _legend(kinds: list[str], with_held: bool) -> list[Line2D]:
+    def marker(shape: str, size: float, face: str, label: str) -> Line2D:
+        return Line2D(
+            [],
+            [],
+            marker=shape,
+            markersize=size,
+            markerfacecolor=face,
+            markeredgecolor="black",
+            linestyle="none",
+            label=label,
+        )
+
+    handles = [
+        Line2D([], [], color=DOOR_COLORS.get(kind, OTHER_COLOR), linestyle=":", linewidth=2, label=f"{kind} (offline)")
+        for kind in kinds
+    ]
+    handles.append(Line2D([], [], color="black", linewidth=0.8, label="trial (online)"))
+    if with_held:
+        handles.append(Line2D([], [], color=HELD_COLOR, linewidth=6, alpha=0.6, label="door held"))
+    handles.append(marker(".", 8, "black", "start of the trial"))
+    return [
+        *handles,
+        marker("o", 9, "white", "first try"),
+        marker("s", 5, "white", "further try"),
+        marker("*", 13, "white", "opened"),
+    ]
+
+
+def to_csv(models: Sequence[HiddenPaths]) -> str:
+    """The numbers: one row a step of a demonstration or of the trial, which says what was tried at it and if held."""
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("model", "path", "kind", "step", "pc1", "pc2", "tried", "held"))
+    for model in models:
+        paths = [(str(number), kind) for number, kind in enumerate(model.kinds)] + [("trial", model.door_kind)]
+        for (name, kind), points in zip(paths, (*model.demonstrations, model.trial), strict=True):
+            tried, held = (dict(model.attempts), model.held) if name == "trial" else ({}, [])
+            writer.writerows(
+                (model.label, name, kind, step, f"{first:.5f}", f"{second:.5f}", tried.get(step, ""), int(step in held))
+                for step, (first, second) in enumerate(points)
+            )
+    return text.getvalue()

@@ -1,0 +1,95 @@
+"""`ufrnn lyapunov`: draw how chaotic the imagined futures are along the demonstrations, model by model."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from lerobot.utils.random_utils import set_seed
+
+from env_door.demonstration import TIMING_STREAM
+from env_door.env import DoorEnv
+from env_door.expert import DoorExpert
+from env_door.provenance import Provenance
+
+from ..analysis.hidden_states import read_demonstrations, states_along
+from ..analysis.lyapunov import exponents_over_time
+from ..analysis.lyapunov_picture import ExponentCurves, draw, to_csv
+from .flags import parse_flags
+from .policies import load_policies, read_provenance
+
+PHASES = ("grasp", "twist", "open")
+"""Phases of the expert that are marked; the doors part at the last one."""
+
+
+@dataclass
+class LyapunovConfig:
+    """Which policies to compare.
+
+    Args:
+        policy_paths (`list[str]`):
+            Checkpoint folders or Hub repositories of `ufrnn` policies.
+        dataset_dir (`Path`):
+            Folder of the demonstrations.
+        output (`Path`, *optional*, defaults to `lyapunov.png`):
+            Picture to write; the numbers go beside it, with the ending `.csv`.
+        labels (`list[str]`, *optional*):
+            Names of the policies; those of the paper by default.
+        horizon (`int`, *optional*, defaults to `10`):
+            Number T of imagined steps over which perturbations grow.
+        seed (`int`, *optional*, defaults to `2000`):
+            Seed of exploration noise.
+    """
+
+    policy_paths: list[str]
+    dataset_dir: Path
+    output: Path = Path("lyapunov.png")
+    labels: list[str] = field(default_factory=list)
+    horizon: int = 10
+    seed: int = 2000
+
+    def __post_init__(self) -> None:
+        if self.horizon < 1:
+            raise ValueError(f"--horizon must be at least 1, got {self.horizon}.")
+
+
+def run(arguments: list[str]) -> None:
+    """Writes the picture and the table."""
+    config = parse_flags(LyapunovConfig, arguments)
+    curves = []
+    for label, policy in load_policies(config.policy_paths, config.labels).items():
+        set_seed(config.seed)
+        states = states_along(policy, read_demonstrations(policy, config.dataset_dir))
+        curves.append(ExponentCurves(label, exponents_over_time(policy.model.network, states, config.horizon)))
+    provenance = read_provenance(config.dataset_dir)
+    draw(curves, phase_starts(provenance) if provenance else {}, config.horizon, config.output)
+    table = config.output.with_suffix(".csv")
+    table.write_text(to_csv(curves))
+    print(f"Lyapunov exponents: {config.output}, {table}")
+
+
+def phase_starts(provenance: Provenance) -> dict[str, list[int]]:
+    """When the phases of the task begin in recorded demonstrations: the expert plans them once more.
+
+    Args:
+        provenance (`Provenance`):
+            How the demonstrations were recorded.
+
+    Returns:
+        `dict[str, list[int]]`: for each phase the step at which it begins, once for each seed.
+    """
+    starts: dict[str, list[int]] = {phase: [] for phase in PHASES}
+    env = DoorEnv(arm=provenance.settings["arm"], door_offset=provenance.settings["door_offset"])
+    try:
+        for seed, kind in {episode["seed"]: episode["kind"] for episode in provenance.episodes}.items():
+            env.reset(seed=seed, options={"kind": kind})
+            expert = DoorExpert(env, directions=(kind,))
+            expert.reset(np.random.default_rng([seed, TIMING_STREAM]))
+            phases = []
+            while expert.phase != "hold":
+                phases.append(expert.phase)
+                expert.act()
+            for phase in PHASES:
+                starts[phase].append(phases.index(phase))
+    finally:
+        env.close()
+    return starts

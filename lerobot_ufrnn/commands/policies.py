@@ -1,0 +1,93 @@
+"""Trained policies to look into: loading and naming them, running a trial with one, what their demonstrations show."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import PreTrainedConfig
+
+import env_door  # noqa: F401  registers the environment
+from env_door.provenance import PROVENANCE_PATH, Provenance
+
+from ..analysis.trial import TrialHistory, run_trial
+from ..modeling_ufrnn import UFRNNPolicy
+
+MODEL_NAMES = {"foresight": "UF-RNN", "noise": "SH-RNN+noise", "none": "SH-RNN"}
+"""What the paper calls a policy with this exploration."""
+
+
+def load_policy(path: str) -> UFRNNPolicy:
+    """Loads a policy with the reference kernel, which keeps what it imagines and needs no compiling.
+
+    Args:
+        path (`str`):
+            Checkpoint folder or Hub repository of a `ufrnn` policy.
+
+    Returns:
+        `UFRNNPolicy`: the policy.
+
+    Raises:
+        ValueError: If the policy is of another type.
+    """
+    config = PreTrainedConfig.from_pretrained(path)
+    if config.type != "ufrnn":
+        raise ValueError(f"'{path}' is a policy of type {config.type}; only ufrnn can be looked into.")
+    config.kernel = "reference"
+    return UFRNNPolicy.from_pretrained(path, config=config)
+
+
+def load_policies(paths: Sequence[str], labels: Sequence[str]) -> dict[str, UFRNNPolicy]:
+    """Loads policies to compare.
+
+    Args:
+        paths (`Sequence[str]`):
+            See `load_policy`.
+        labels (`Sequence[str]`):
+            Their names; when empty, what the paper calls a policy with such exploration.
+
+    Returns:
+        `dict[str, UFRNNPolicy]`: the policies by name, in order.
+
+    Raises:
+        ValueError: If there is no policy, one is of another type, or they cannot be told apart by their names.
+    """
+    if not paths:
+        raise ValueError("--policy_paths must name one or more checkpoints, such as [outputs/a,outputs/b]; got [].")
+    if labels and len(labels) != len(paths):
+        raise ValueError(f"--labels must be one for each of the {len(paths)} policies, got {list(labels)}.")
+    policies = [load_policy(path) for path in paths]
+    names = list(labels) or [MODEL_NAMES[policy.config.exploration] for policy in policies]
+    if len(set(names)) != len(names):
+        raise ValueError(f"The policies would be called {names}; tell them apart with --labels=[...].")
+    return dict(zip(names, policies, strict=True))
+
+
+def run_door_trial(policy: UFRNNPolicy, seed: int, num_steps: int, **options: Any) -> TrialHistory:
+    """Runs one trial with a door.
+
+    Args:
+        policy (`UFRNNPolicy`):
+            Trained policy.
+        seed (`int`):
+            Seed of environment and exploration noise.
+        num_steps (`int`):
+            Longest trial in steps.
+        **options (`Any`):
+            Options of [`~env_door.env.DoorEnv`].
+
+    Returns:
+        `TrialHistory`: the trial.
+    """
+    env = gym.make("env_door/Door-v0", max_episode_steps=num_steps, **options)
+    try:
+        return run_trial(policy, env, seed)
+    finally:
+        env.close()
+
+
+def read_provenance(dataset_dir: Path) -> Provenance | None:
+    """How a dataset was recorded, or `None` if `ufrnn record` did not record it."""
+    path = dataset_dir / PROVENANCE_PATH
+    return Provenance(**json.loads(path.read_text())) if path.exists() else None
