@@ -18,7 +18,7 @@ CHOICES = {
     "variance_baseline": ("common", "candidate"),
     "variance_aggregation": ("variance", "entropy"),
     "horizon_mode": ("fixed", "learned"),
-    "joint_target": ("action", "next_state"),
+    "command_target": ("action", "next_state"),
     "kernel": ("auto", "fast", "reference"),
 }
 
@@ -59,6 +59,26 @@ class UFRNNConfig(PreTrainedConfig):
         keep_unperturbed (`bool`, *optional*, defaults to `False`):
             Whether the unperturbed hidden state is one of the N candidates.
 
+        recall (`bool`, *optional*, defaults to `True`):
+            Whether acting goes back to a remembered state when the joints are not where they were predicted to be, and
+            tries another future from there (see `recall.py`; not in the paper). Not used in training.
+        surprise_threshold (`float`, *optional*, defaults to `4.5`):
+            Squared prediction error of the joints, in units of the predicted variance, from which to go back. It is one
+            on average while all goes as foreseen.
+        recall_rewind (`int`, *optional*, defaults to `8`):
+            Steps to go back from the last unsurprised one.
+        recall_samples (`int`, *optional*, defaults to `96`):
+            Number of perturbed copies of the remembered state.
+        recall_noise (`tuple[float, float]`, *optional*, defaults to `(0.2, 1.5)`):
+            Standard deviation of the perturbation of the first and of the last copy; evenly spaced between.
+        recall_horizon (`int`, *optional*, defaults to `40`):
+            Imagined steps by whose end the copies' futures are compared.
+        recall_commitment (`int`, *optional*, defaults to `6`):
+            First imagined steps, in which the perturbation settles, that are skipped, and as many after them that are
+            carried out without looking.
+        recall_memory (`float`, *optional*, defaults to `200.0`):
+            Steps in which the memory of a failed try fades to 1/e; 0 forgets at once.
+
         joint_hidden_dim (`int`, *optional*, defaults to `50`):
             Hidden size of `LSTM_joint`.
         image_hidden_dim (`int`, *optional*, defaults to `50`):
@@ -67,9 +87,9 @@ class UFRNNConfig(PreTrainedConfig):
             Hidden size of `LSTM_shared`.
         log_variance_range (`tuple[float, float]`, *optional*, defaults to `(-9.0, 3.0)`):
             Soft bounds of predicted log-variances, in scaled units (data within [-0.8, 0.8]).
-        joint_target (`str`, *optional*, defaults to `"action"`):
-            What the joint mean learns: the commanded `action` of this step, or the measured `next_state` as in the
-            paper. A gripper that squeezes needs the command; the measurement would let go.
+        command_target (`str`, *optional*, defaults to `"action"`):
+            What is commanded: the demonstrated `action`, learned by a head of its own, or the predicted `next_state`
+            itself as in the paper. A gripper that squeezes needs the action; its measurement would let go.
 
         image_size (`tuple[int, int]`, *optional*, defaults to `(128, 128)`):
             Height and width in pixels that camera images are resized to.
@@ -110,9 +130,9 @@ class UFRNNConfig(PreTrainedConfig):
             Longest stall in steps.
         stall_stretch (`float`, *optional*, defaults to `1.3`):
             Longest stalled episode as a multiple of the longest episode of the batch; bounds the time of an update.
-        optimizer_lr (`float`, *optional*, defaults to `1e-3`):
+        optimizer_lr (`float`, *optional*, defaults to `5e-4`):
             Adam learning rate of the recurrent network. The paper states 1e-4.
-        optimizer_grad_clip_norm (`float`, *optional*, defaults to `10.0`):
+        optimizer_grad_clip_norm (`float`, *optional*, defaults to `1.0`):
             Largest norm of the gradient.
         drop_n_last_frames (`int`, *optional*, defaults to `0`):
             Read by LeRobot's sampler. Training sets it so that each episode is one item (see `UFRNNPolicy`).
@@ -133,11 +153,20 @@ class UFRNNConfig(PreTrainedConfig):
     variance_aggregation: str = "variance"
     keep_unperturbed: bool = False
 
+    recall: bool = True
+    surprise_threshold: float = 4.5
+    recall_rewind: int = 8
+    recall_samples: int = 96
+    recall_noise: tuple[float, float] = (0.2, 1.5)
+    recall_horizon: int = 40
+    recall_commitment: int = 6
+    recall_memory: float = 200.0
+
     joint_hidden_dim: int = 50
     image_hidden_dim: int = 50
     shared_hidden_dim: int = 20
     log_variance_range: tuple[float, float] = (-9.0, 3.0)
-    joint_target: str = "action"
+    command_target: str = "action"
 
     image_size: tuple[int, int] = (128, 128)
     feature_dim: int = 10
@@ -157,8 +186,8 @@ class UFRNNConfig(PreTrainedConfig):
     stall_probability: float = 0.0
     stall_steps: int = 12
     stall_stretch: float = 1.3
-    optimizer_lr: float = 1e-3
-    optimizer_grad_clip_norm: float = 10.0
+    optimizer_lr: float = 5e-4
+    optimizer_grad_clip_norm: float = 1.0
 
     # LeRobot's own fields, with what suits this policy.
     drop_n_last_frames: int = 0
@@ -178,15 +207,24 @@ class UFRNNConfig(PreTrainedConfig):
         for name in (
             *("num_samples", "horizon", "joint_hidden_dim", "image_hidden_dim", "shared_hidden_dim"),
             *("feature_dim", "autoencoder_hidden_dim", "autoencoder_batch_size", "autoencoder_steps", "stall_steps"),
-            "conv_first_stride",
+            *("conv_first_stride", "recall_samples", "recall_horizon"),
         ):
             self._require(name, getattr(self, name) >= 1, "at least 1")
-        for name in ("image_shift", "drop_n_last_frames"):
+        for name in ("image_shift", "drop_n_last_frames", "recall_rewind"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         for name in ("image_jitter", "image_noise", "input_noise"):
             self._require(name, 0 <= getattr(self, name) < 1, "from 0 to below 1")
         for name in ("optimizer_lr", "autoencoder_lr", "optimizer_grad_clip_norm"):
             self._require(name, 0 < getattr(self, name) < math.inf, "above 0")
+        self._require("surprise_threshold", 1 < self.surprise_threshold < math.inf, "above 1")
+        self._require("recall_memory", 0 <= self.recall_memory < math.inf, "at least 0")
+        self._require(
+            "recall_commitment",
+            0 <= self.recall_commitment < self.recall_horizon,
+            f"from 0 to below `recall_horizon` ({self.recall_horizon})",
+        )
+        low, high = self._pair("recall_noise")
+        self._require("recall_noise", 0 <= low <= high < math.inf, "two numbers with 0 <= low <= high")
         self._require("stall_probability", 0 <= self.stall_probability <= 1, "from 0 to 1")
         self._require("stall_stretch", 1 <= self.stall_stretch < math.inf, "at least 1")
         low, high = self._pair("noise_range")

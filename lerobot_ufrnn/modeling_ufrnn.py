@@ -15,6 +15,7 @@ from .configuration_ufrnn import UFRNNConfig
 from .episodes import Episode, EpisodeStore
 from .foresight import Foresight, ForesightTrace, NoiseSchedule
 from .networks import SHLSTM, ImageEncoder, Prediction, RangeScaler, gaussian_nll
+from .recall import Recall
 from .recurrent import UFRNN, Memory
 
 logger = logging.getLogger(__name__)
@@ -28,8 +29,9 @@ class UFRNNPolicy(PreTrainedPolicy):
     """Uncertainty-driven Foresight RNN (UF-RNN), and its baselines SH-RNN+noise and SH-RNN.
 
     **Acting.** `select_action` encodes the cameras, scales the measured joints, advances the hidden state by one step,
-    lets foresight refine it and returns the predicted joints as absolute targets. The hidden state lives from `reset`
-    to `reset`; `last_trace` and `memory` show what foresight saw.
+    lets foresight refine it, goes back to a remembered one when surprised (`recall.py`), and returns absolute joint
+    targets. The hidden state lives from `reset` to `reset`; `memory`, `last_trace` (of foresight at every step, so
+    without recall) and `recall.events` show what happened.
 
     **Training** with stock `lerobot-train` goes through two phases, counted in updates and saved with the checkpoint:
     first the autoencoder (`autoencoder_steps` updates on frames of the batch's episodes), then, with its features
@@ -83,6 +85,7 @@ class UFRNNPolicy(PreTrainedPolicy):
                 config.image_hidden_dim,
                 config.shared_hidden_dim,
                 config.log_variance_range,
+                config.command_target == "action",
             ),
             Foresight(
                 config.exploration,
@@ -96,6 +99,18 @@ class UFRNNPolicy(PreTrainedPolicy):
                 config.keep_unperturbed,
             ),
         )
+        self.recall: Recall | None = None
+        if config.recall:
+            self.recall = Recall(
+                self.model,
+                config.surprise_threshold,
+                config.recall_rewind,
+                config.recall_samples,
+                config.recall_noise,
+                config.recall_horizon,
+                config.recall_commitment,
+                config.recall_memory,
+            )
         # Training noise is a function of this seed and the update, so that a resumed run goes on exactly as if whole.
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
@@ -113,6 +128,8 @@ class UFRNNPolicy(PreTrainedPolicy):
         """Forgets the episode: the next `select_action` starts from the zero state, with any batch size."""
         self.memory: Memory | None = None
         self.last_trace: ForesightTrace | None = None
+        if self.recall is not None:
+            self.recall.reset()
         self._thread = threading.get_ident()
 
     @torch.no_grad()
@@ -140,13 +157,11 @@ class UFRNNPolicy(PreTrainedPolicy):
         features = self.image_encoder({camera: batch[camera] for camera in self.config.cameras})
         if self.memory is None:
             self.memory = self.model.initial_memory(len(joints))
-        self.memory, self.last_trace = self.model.advance(torch.cat((joints, features), dim=-1), self.memory)
-        action = self.joint_scaler.unscale(self.memory.prediction.mean[:, : self.model.network.joint_dim])
-        if not torch.isfinite(action).all():
-            raise RuntimeError(
-                "The policy predicts NaN or infinite joints: its weights are broken; train or load it anew."
-            )
-        return action
+        stepper = self.model if self.recall is None else self.recall
+        self.memory, self.last_trace = stepper.advance(torch.cat((joints, features), dim=-1), self.memory)
+        if not torch.isfinite(torch.cat(self.memory.prediction, dim=-1)).all():
+            raise RuntimeError("The policy predicts NaN or infinity: its weights are broken; train or load it anew.")
+        return self.joint_scaler.unscale(self.memory.prediction.command)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """One-step chunk (B, 1, D_j) of `select_action`; the policy re-plans at every step by design."""
@@ -259,20 +274,25 @@ class UFRNNPolicy(PreTrainedPolicy):
         return loss, {"autoencoder_mse": loss.item()}
 
     def _recurrent_loss(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, dict[str, float]]:
-        inputs, targets, mask = self._sequences(episodes, generator)
+        inputs, targets, commands, mask = self._sequences(episodes, generator)
         if self.training:
             noise = torch.randn(inputs.shape, generator=generator, device=inputs.device)
             inputs = inputs + self.config.input_noise * noise
         prediction, trace = self.model(inputs, generator)
         nll = gaussian_nll(targets, prediction.mean, prediction.log_variance).sum(-1)  # (B, L)
         loss = nll[mask].mean()
+        joint_dim = self.model.network.joint_dim
+        if self.config.command_target == "action":
+            # A command is as uncertain as the joints that it leads to.
+            log_variance = prediction.log_variance[..., :joint_dim]
+            loss = loss + gaussian_nll(commands, prediction.command, log_variance).sum(-1)[mask].mean()
         variance = self.model.modality_variance(prediction)[mask].detach()  # (M, 2)
         if self.training:
             self.model.foresight.schedule.observe(variance)
-        joint_dim = self.model.network.joint_dim
         error = (targets - prediction.mean).detach().square()[mask]
         logs = {
-            "nll": loss.item(),
+            "nll": nll[mask].mean().item(),
+            "command_rmse": (commands - prediction.command).detach()[mask].square().mean().sqrt().item(),
             "joint_rmse": error[:, :joint_dim].mean().sqrt().item(),
             "feature_rmse": error[:, joint_dim:].mean().sqrt().item(),
             "joint_variance": variance[:, 0].mean().item(),
@@ -285,29 +305,30 @@ class UFRNNPolicy(PreTrainedPolicy):
                 loss = loss + _horizon_loss(prediction, trace, self.config.horizon, mask)
         return loss, logs
 
-    def _sequences(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Scaled inputs and targets (B, L, D) and the mask (B, L) of the steps that exist."""
-        pairs = [self._input_target(episode) for episode in episodes]
+    def _sequences(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Scaled inputs and targets (B, L, D), commands (B, L, D_j) and the mask (B, L) of the steps that exist."""
+        sequences = [self._sequence(episode) for episode in episodes]
         if self.training and self.config.stall_probability > 0:
-            longest = int(max(len(inputs) for inputs, _ in pairs) * self.config.stall_stretch)
+            longest = int(max(len(inputs) for inputs, *_ in sequences) * self.config.stall_stretch)
             cpu = torch.Generator().manual_seed(generator.initial_seed())
-            for row, (inputs, target) in enumerate(pairs):
+            for row, values in enumerate(sequences):
                 index = stall_indices(
-                    len(inputs), self.config.stall_probability, self.config.stall_steps, longest, cpu
-                ).to(inputs.device)
-                pairs[row] = (inputs[index], target[index])
-        inputs, targets = (nn.utils.rnn.pad_sequence(list(rows), batch_first=True) for rows in zip(*pairs, strict=True))
-        lengths = torch.tensor([len(inputs) for inputs, _ in pairs], device=inputs.device)
-        return inputs, targets, torch.arange(inputs.shape[1], device=inputs.device) < lengths[:, None]
+                    len(values[0]), self.config.stall_probability, self.config.stall_steps, longest, cpu
+                ).to(values[0].device)
+                sequences[row] = (values[0][index], values[1][index], values[2][index])
+        lengths = torch.tensor([len(inputs) for inputs, *_ in sequences], device=self.updates.device)
+        inputs, targets, commands = (
+            nn.utils.rnn.pad_sequence(list(rows), batch_first=True) for rows in zip(*sequences, strict=True)
+        )
+        return inputs, targets, commands, torch.arange(inputs.shape[1], device=inputs.device) < lengths[:, None]
 
-    def _input_target(self, episode: Episode) -> tuple[Tensor, Tensor]:
+    def _sequence(self, episode: Episode) -> tuple[Tensor, Tensor, Tensor]:
+        """Inputs and what they lead to (L - 1, D), and the commands in between (L - 1, D_j), all scaled."""
         device = self.updates.device
         states = self.joint_scaler.scale(episode.states.to(device))
         features = self.image_encoder.scaler.scale(episode.features)
-        joint_target = self.joint_scaler.scale(episode.actions.to(device))[:-1]
-        if self.config.joint_target == "next_state":
-            joint_target = states[1:]
-        return torch.cat((states, features), -1)[:-1], torch.cat((joint_target, features[1:]), -1)
+        sensed = torch.cat((states, features), -1)
+        return sensed[:-1], sensed[1:], self.joint_scaler.scale(episode.actions.to(device))[:-1]
 
     def _fit_joint_scaler(self, stats: dict[str, dict[str, Tensor]]) -> None:
         """One range for measured and commanded joints: a command fed back must mean what a measurement means."""
@@ -319,7 +340,9 @@ class UFRNNPolicy(PreTrainedPolicy):
                 "Record the dataset with a current LeRobot, which writes meta/stats.json."
             ) from error
         state_low, action_low, state_high, action_high = bounds
-        self.joint_scaler.fit(torch.minimum(state_low, action_low), torch.maximum(state_high, action_high))
+        low, high = torch.minimum(state_low, action_low), torch.maximum(state_high, action_high)
+        # A joint that hardly moves is not worth following to a fraction of a degree.
+        self.joint_scaler.fit(low, high, relative_floor=0.25)
 
     # ── Loading ───────────────────────────────────────────────────────
 

@@ -32,7 +32,7 @@ class RangeScaler(nn.Module):
         return not torch.equal(self.high, self.low)
 
     @torch.no_grad()
-    def fit(self, low: Tensor, high: Tensor, floor: float = 1e-3) -> None:
+    def fit(self, low: Tensor, high: Tensor, floor: float = 1e-3, relative_floor: float = 0.0) -> None:
         """Sets the range.
 
         Args:
@@ -43,6 +43,8 @@ class RangeScaler(nn.Module):
             floor (`float`, *optional*, defaults to `1e-3`):
                 Narrowest range allowed, in the unit of the data: a dimension that never moves must not blow its
                 measurement noise up to full scale.
+            relative_floor (`float`, *optional*, defaults to `0.0`):
+                The same as a fraction of the widest dimension's range.
 
         Raises:
             ValueError: If a bound is not finite or `high` is below `low`.
@@ -53,7 +55,8 @@ class RangeScaler(nn.Module):
             raise ValueError(f"A range must be finite, got low={low.tolist()}, high={high.tolist()}.")
         if (high < low).any():
             raise ValueError(f"A range needs low <= high, got low={low.tolist()}, high={high.tolist()}.")
-        margin = (floor - (high - low)).clamp(min=0) / 2
+        narrowest = max(floor, relative_floor * float((high - low).max()))
+        margin = (narrowest - (high - low)).clamp(min=0) / 2
         self.low.copy_(low - margin)
         self.high.copy_(high + margin)
 

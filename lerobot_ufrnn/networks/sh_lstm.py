@@ -30,11 +30,13 @@ class Prediction(NamedTuple):
         mean (`Tensor`): scaled next joints and image features, (B, D), in (-1, 1).
         log_variance (`Tensor`): log-variance of each, (B, D).
         step (`Tensor`): one scalar a modality for a learned foresight horizon, (B, 2), unbounded.
+        command (`Tensor`): scaled joint targets that bring the next values about, (B, D_j), in (-1, 1).
     """
 
     mean: Tensor
     log_variance: Tensor
     step: Tensor
+    command: Tensor
 
 
 class SHLSTM(nn.Module):
@@ -53,6 +55,8 @@ class SHLSTM(nn.Module):
             Hidden size of `LSTM_shared`.
         log_variance_range (`tuple[float, float]`):
             Bounds of every predicted log-variance.
+        command_head (`bool`, *optional*, defaults to `True`):
+            Whether commands are read off by a head of their own; otherwise the predicted joints are commanded.
     """
 
     def __init__(
@@ -63,6 +67,7 @@ class SHLSTM(nn.Module):
         image_hidden_dim: int,
         shared_hidden_dim: int,
         log_variance_range: tuple[float, float],
+        command_head: bool = True,
     ):
         super().__init__()
         self.joint_dim = joint_dim
@@ -75,6 +80,7 @@ class SHLSTM(nn.Module):
         self.shared_to_lower = nn.Linear(shared_hidden_dim, lower_hidden_dim)
         self.joint_head = nn.Linear(joint_hidden_dim, 2 * joint_dim + 1)
         self.image_head = nn.Linear(image_hidden_dim, 2 * feature_dim + 1)
+        self.command_head = nn.Linear(joint_hidden_dim, joint_dim) if command_head else None
 
     @property
     def state_sizes(self) -> tuple[int, ...]:
@@ -129,7 +135,7 @@ class SHLSTM(nn.Module):
                 Any hidden state, (B, hidden size) each.
 
         Returns:
-            `Prediction`: means, log-variances and step scalars.
+            `Prediction`: means, log-variances, step scalars and commands.
         """
         joint = self.joint_head(state.h_joint)
         image = self.image_head(state.h_image)
@@ -137,7 +143,8 @@ class SHLSTM(nn.Module):
         mean = torch.tanh(torch.cat((joint[..., :j], image[..., :f]), dim=-1))
         raw_log_variance = torch.cat((joint[..., j : 2 * j], image[..., f : 2 * f]), dim=-1)
         step = torch.cat((joint[..., 2 * j :], image[..., 2 * f :]), dim=-1)
-        return Prediction(mean, bound_log_variance(raw_log_variance, *self.log_variance_range), step)
+        command = mean[..., :j] if self.command_head is None else torch.tanh(self.command_head(state.h_joint))
+        return Prediction(mean, bound_log_variance(raw_log_variance, *self.log_variance_range), step, command)
 
     def predict_mean(self, state: HiddenState) -> Tensor:
         """Only the means of `predict`, (B, D): all that a closed loop feeds back."""
