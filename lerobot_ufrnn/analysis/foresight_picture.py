@@ -1,131 +1,199 @@
 """A picture of one foresight step: what the robot saw, what it imagined, and which future it kept."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ..foresight import ForesightTrace
+from ..foresight import uncertainty
 from ..modeling_ufrnn import UFRNNPolicy
+from .trial import Imagination, TrialHistory
+
+STRIP_COLUMNS = 5
+MOST_SHOWN = 5
 
 
-@dataclass
-class TrialHistory:
-    """One trial, step by step.
+def draw(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
+    """Draws what was imagined at a decisive step of a trial and writes it to `path`.
 
-    Attributes:
-        door_kind (`str`): kind of the door.
-        images (`list[np.ndarray]`): first camera at each step, uint8 (height, width, 3).
-        joints (`list[np.ndarray]`): measured joints at each step, (D_j,).
-        variances (`list[np.ndarray]`): mean predicted variance of joints and image features after each step, (2,).
-        traces (`list[ForesightTrace]`): what foresight saw at each step.
-        first_try (`int | None`): step at which the door was first tried, if it was.
-        attempts (`tuple[str, ...]`): directions tried, in order.
-        success (`bool`): whether the door was opened.
-    """
-
-    door_kind: str
-    images: list[np.ndarray]
-    joints: list[np.ndarray]
-    variances: list[np.ndarray]
-    traces: list[ForesightTrace]
-    first_try: int | None
-    attempts: tuple[str, ...]
-    success: bool
-
-    @property
-    def branch_step(self) -> int:
-        """`int`: where the imagined futures part most in the 2 s before the first try (before the end, without one)."""
-        stop = (self.first_try if self.first_try is not None else len(self.traces) - 1) + 1
-        start = max(0, stop - 20)
-        spreads = [trace.imagined.mean[-1, :, 0].std(dim=0).mean().item() for trace in self.traces[start:stop]]
-        return start + int(np.argmax(spreads))
-
-
-def draw(policy: UFRNNPolicy, history: TrialHistory, joint_names: tuple[str, ...], path: Path) -> None:
-    """Draws foresight at the branch of a trial and writes it to `path`.
-
-    Top: the camera, its reconstruction, and each candidate's imagined image at the horizon. Below: the imagined
-    paths of the joint that the candidates disagree most about, and the predicted variance over the whole trial.
+    Top: the camera, its reconstruction, and imagined images at the horizon. Below: the imagined paths of the joint that
+    the candidates disagree most about, and the predicted variance over the whole trial.
 
     Args:
         policy (`UFRNNPolicy`):
             The policy that ran the trial.
         history (`TrialHistory`):
             The trial.
-        joint_names (`tuple[str, ...]`):
-            Names of the joints, for the axis label.
         path (`Path`):
             Where to write the PNG.
+
+    Raises:
+        ValueError: If nothing was imagined in the trial.
     """
-    step = history.branch_step
-    trace = history.traces[step]
-    camera = policy.config.cameras[0]
-    joint_dim = policy.model.network.joint_dim
-    chosen = int(trace.chosen[0])
-    num_samples = trace.final.shape[0]
-    imagined = _decode(policy, trace.imagined.mean[-1, :, 0, joint_dim:], camera)  # (N, height, width, 3)
-    image = torch.from_numpy(history.images[step]).permute(2, 0, 1)[None].to(trace.imagined.mean.device)
+    imagined = decisive(history, policy.model.network.joint_dim)
+    camera, joint_dim = policy.config.cameras[0], policy.model.network.joint_dim
+    shown = _representatives(imagined, joint_dim)
+    pictures = _decode(policy, imagined.futures.mean[-1, shown, joint_dim:], camera)  # (n, height, width, 3)
+    image = torch.from_numpy(history.images[imagined.step]).permute(2, 0, 1)[None].to(imagined.futures.mean.device)
     with torch.no_grad():
         seen = policy.image_encoder(dict.fromkeys(policy.config.cameras, image))
     reconstruction = _decode(policy, seen, camera)[0]
 
     with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(2 * (num_samples + 2), 6), layout="constrained")
+        figure = Figure(figsize=(2 * (len(shown) + 2), 6), layout="constrained")
         top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.1)))
-        panels = top.subplots(1, num_samples + 2)
-        titles = [f"camera, step {step}", "reconstruction"]
-        titles += [f"future {n + 1}\nuncertainty {trace.final[n, 0]:.3g}" for n in range(num_samples)]
+        panels = top.subplots(1, len(shown) + 2)
+        titles = [f"camera, step {imagined.step}", "reconstruction"]
+        titles += [_title(policy, imagined, number) for number in shown]
         for index, (panel, picture, title) in enumerate(
-            zip(panels, [history.images[step], reconstruction, *imagined], titles, strict=True)
+            zip(panels, [history.images[imagined.step], reconstruction, *pictures], titles, strict=True)
         ):
-            kept = index - 2 == chosen
+            kept = index >= 2 and shown[index - 2] == imagined.chosen
             panel.imshow(picture)
-            panel.set_title(title + (" (kept)" if kept else ""), fontsize=9, color="C3" if kept else "black")
-            panel.set_xticks([])
-            panel.set_yticks([])
-            for spine in panel.spines.values():
-                spine.set(visible=kept, color="C3", linewidth=3)
+            panel.set_title(title, fontsize=9, color="C3" if kept else "black")
+            _frame(panel, kept)
         paths, uncertainties = bottom.subplots(1, 2)
-        _draw_paths(paths, policy, history, trace, step, joint_names)
-        _draw_uncertainty(uncertainties, history, step)
-        tried = ", ".join(history.attempts) or "nothing"
+        _draw_paths(paths, policy, history, imagined)
+        _draw_uncertainty(uncertainties, history, imagined)
+        tried = ", ".join(direction for _, direction in history.attempts) or "nothing"
         result = "opened" if history.success else "not opened"
-        figure.suptitle(f"Foresight at the branch (in truth a {history.door_kind} door; tried: {tried}; {result})")
+        figure.suptitle(f"What was imagined (in truth a {history.door_kind} door; tried: {tried}; {result})")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=110)
 
 
-def _draw_paths(axes, policy, history, trace, step, joint_names) -> None:
-    joint_dim = policy.model.network.joint_dim
-    imagined = policy.joint_scaler.unscale(trace.imagined.mean[:, :, 0, :joint_dim]).cpu().numpy()  # (T, N, D_j)
+def draw_strip(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
+    """Draws imagined futures of a decisive step beside what happened, and writes them to `path`.
+
+    One row a candidate, the kept one marked, and the camera in the last row; one column a step.
+
+    Args:
+        policy (`UFRNNPolicy`):
+            The policy that ran the trial.
+        history (`TrialHistory`):
+            The trial.
+        path (`Path`):
+            Where to write the PNG.
+
+    Raises:
+        ValueError: If nothing was imagined in the trial.
+    """
+    joint_dim, camera = policy.model.network.joint_dim, policy.config.cameras[0]
+    imagined = decisive(history, joint_dim)
+    rows = _representatives(imagined, joint_dim)
+    features = imagined.futures.mean[:, rows, joint_dim:]  # (T, n, D_f)
+    columns = range(0, len(features), max(2, -(-len(features) // STRIP_COLUMNS)))
+    with matplotlib.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(1.1 + 1.25 * len(columns), 0.7 + 1.3 * (len(rows) + 1)), layout="constrained")
+        panels = figure.subplots(len(rows) + 1, len(columns), squeeze=False)
+        for column, index in enumerate(columns):
+            ahead = imagined.ahead + index
+            now = imagined.step + ahead
+            pictures = [*_decode(policy, features[index], camera), *history.images[now : now + 1]]
+            for panel, picture in zip(panels[:, column], pictures, strict=False):
+                panel.imshow(picture)
+            panels[0, column].set_title(f"t + {ahead}", fontsize=9)
+            for number, panel in zip([*rows, None], panels[:, column], strict=True):
+                _frame(panel, number == imagined.chosen)
+            if len(pictures) == len(rows):
+                panels[-1, column].text(0.5, 0.5, "trial over", ha="center", va="center", fontsize=8)
+        for number, panel in zip(rows, panels[:-1, 0], strict=True):
+            label = f"future {number + 1}" + ("\n(kept)" if number == imagined.chosen else "")
+            panel.set_ylabel(label, color="C3" if number == imagined.chosen else "black")
+        panels[-1, 0].set_ylabel("what\nhappened")
+        figure.suptitle(f"Imagined at step t = {imagined.step} of a trial with a {history.door_kind} door", fontsize=10)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110)
+
+
+def decisive(history: TrialHistory, joint_dim: int) -> Imagination:
+    """The step at which what was imagined mattered most.
+
+    With recall the last time that the trial went back, which a door that was opened was opened by. With foresight at
+    every step the one whose futures part most in the 2 s before the first try (before the end, without one).
+
+    Args:
+        history (`TrialHistory`):
+            The trial.
+        joint_dim (`int`):
+            Number of joints.
+
+    Returns:
+        `Imagination`: the futures of that step.
+
+    Raises:
+        ValueError: If nothing was imagined in the trial.
+    """
+    if not history.imaginations:
+        raise ValueError(
+            "Nothing was imagined in this trial: the policy has no foresight, or was never surprised. Take a trial in "
+            "which the first try is wrong: another --kind or --seed."
+        )
+    if history.imaginations[0].refuted is not None:
+        return history.imaginations[-1]
+    last = history.first_try if history.first_try is not None else len(history.states) - 1
+    near = [imagined for imagined in history.imaginations if last - 20 < imagined.step <= last]
+    return max(near, key=lambda imagined: imagined.futures.mean[-1].std(dim=0).mean().item())
+
+
+def _representatives(imagined: Imagination, joint_dim: int) -> list[int]:
+    """The kept candidate and others that differ: each next one is the farthest from those before (k-centre)."""
+    ends = imagined.futures.mean[-1, :, :joint_dim]
+    shown = [imagined.chosen]
+    while len(shown) < min(MOST_SHOWN, len(ends)):
+        distance = torch.cdist(ends, ends[shown]).amin(1)
+        distance[shown] = -1
+        shown.append(int(distance.argmax()))
+    return sorted(shown)
+
+
+def _title(policy: UFRNNPolicy, imagined: Imagination, number: int) -> str:
+    kept = " (kept)" if number == imagined.chosen else ""
+    if imagined.refuted is not None:
+        return f"future {number + 1}{kept}\nlike a failed try: {min(imagined.refuted[number], 1):.0%}"
+    network, foresight = policy.model.network, policy.model.foresight
+    final = uncertainty(imagined.futures.log_variance[-1, number], network.joint_dim, foresight.aggregation)
+    return f"future {number + 1}{kept}\nuncertainty {final:.3g}"
+
+
+def _frame(panel: Axes, kept: bool) -> None:
+    panel.set_xticks([])
+    panel.set_yticks([])
+    for spine in panel.spines.values():
+        spine.set(visible=kept, color="C3", linewidth=3)
+
+
+def _draw_paths(axes: Axes, policy: UFRNNPolicy, history: TrialHistory, imagined: Imagination) -> None:
+    joint_dim, step, chosen = policy.model.network.joint_dim, imagined.step, imagined.chosen
+    paths = policy.joint_scaler.unscale(imagined.futures.mean[..., :joint_dim]).cpu().numpy()  # (T, N, D_j)
     # The joint whose imagined paths spread most, relative to its range.
-    joint = int(trace.imagined.mean[-1, :, 0, :joint_dim].std(dim=0).argmax())
+    joint = int(imagined.futures.mean[-1, :, :joint_dim].std(dim=0).argmax())
     start = max(0, step - 20)
     measured = np.array([joints[joint] for joints in history.joints[start:]])
     axes.plot(np.arange(start, start + len(measured)), measured, color="black", linewidth=1.5, label="what happened")
-    future = np.arange(step + 2, step + 2 + len(imagined))
-    chosen = int(trace.chosen[0])
-    others = np.delete(imagined[:, :, joint], chosen, axis=1)
+    future = np.arange(step + imagined.ahead, step + imagined.ahead + len(paths))
+    others = np.delete(paths[:, :, joint], chosen, axis=1)
     if others.size:
-        axes.plot(future, others[:, 0], color="C0", linewidth=1, label="imagined")
-        axes.plot(future, others[:, 1:], color="C0", linewidth=1)
-    axes.plot(future, imagined[:, chosen, joint], color="C3", linewidth=2.5, label="imagined and kept")
+        faint = 1.0 if others.shape[1] < 10 else 0.35
+        axes.plot(future, others[:, 0], color="C0", linewidth=1, alpha=faint, label="imagined")
+        axes.plot(future, others[:, 1:], color="C0", linewidth=1, alpha=faint)
+    axes.plot(future, paths[:, chosen, joint], color="C3", linewidth=2.5, label="imagined and kept")
     axes.axvline(step, color="grey", linewidth=0.8, linestyle=":")
-    axes.set(xlabel="step (10 Hz)", ylabel=f"{joint_names[joint]} (rad)", xlim=(start, step + len(imagined) + 25))
+    axes.set(xlabel="step (10 Hz)", ylabel=f"{history.joint_names[joint]} (rad)", xlim=(start, step + len(paths) + 25))
     axes.set_title("Where the imagined futures part", fontsize=10)
     axes.legend(frameon=False)
 
 
-def _draw_uncertainty(axes, history: TrialHistory, step: int) -> None:
+def _draw_uncertainty(axes: Axes, history: TrialHistory, imagined: Imagination) -> None:
     variances = np.array(history.variances)
     for column, name in enumerate(("joints", "image features")):
         axes.semilogy(variances[:, column], color=f"C{column}", label=name)
-    axes.axvline(step, color="grey", linewidth=0.8, linestyle=":")
+    for other in history.imaginations if imagined.refuted is not None else [imagined]:
+        axes.axvline(other.step, color="grey", linewidth=0.8, linestyle=":")
     if history.first_try is not None:
         axes.axvline(history.first_try, color="C3", linewidth=0.8)
         axes.annotate(" first try", (history.first_try, variances.max()), color="C3", va="top", fontsize=8)

@@ -3,12 +3,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
 from env_door.recording import record
 from env_door.recording_config import RecordConfig
 from lerobot_ufrnn.commands import COMMANDS, main
+from lerobot_ufrnn.commands.lyapunov import phase_starts
+from lerobot_ufrnn.commands.policies import read_provenance
 
 
 def test_help_names_every_command(capsys):
@@ -33,6 +37,10 @@ def test_an_unknown_command_is_refused(capsys):
         (["demo", "--trials_per_kind=0"], "--trials_per_kind must be at least 1"),
         (["demo", "--exploration=magic"], "--exploration must be one of"),
         (["foresight", "--policy_path=/nowhere"], "/nowhere"),
+        (["hidden", "--policy_paths=[/nowhere]", "--dataset_dir=/nowhere"], "/nowhere"),
+        (["hidden", "--policy_paths=[a,b]", "--dataset_dir=/nowhere", "--labels=[a]"], "--labels must be one for each"),
+        (["lyapunov", "--policy_paths=[]", "--dataset_dir=/nowhere"], "--policy_paths must name one or more"),
+        (["lyapunov", "--policy_paths=[a]", "--dataset_dir=/nowhere", "--horizon=0"], "--horizon must be at least 1"),
     ],
 )
 def test_a_bad_flag_ends_with_a_message_and_no_traceback(arguments, message, capsys):
@@ -83,7 +91,7 @@ def train_flags(root: Path, output: Path) -> list[str]:
     ]
 
 
-def test_stock_training_resumes_and_stock_evaluation_reports_each_door(demonstrations, tmp_path):
+def test_stock_training_resumes_and_stock_evaluation_reports_each_door(demonstrations, tmp_path, capsys):
     # That a resumed run computes what an uninterrupted one would is shown in test_modeling_ufrnn.py.
     run, last = tmp_path / "run", Path("checkpoints/last/pretrained_model")
     lerobot("train", *train_flags(demonstrations, run), "--steps=3")
@@ -111,8 +119,36 @@ def test_stock_training_resumes_and_stock_evaluation_reports_each_door(demonstra
     assert sorted(trial["door_kind"] for trial in trials) == ["pull"] * 2 + ["push"] * 2 + ["slide"] * 2
     assert all(trial["steps"] == 4 and not trial["success"] for trial in trials)
 
-    assert main(["foresight", f"--policy_path={run / last}", f"--output={tmp_path / 'f.png'}", "--num_steps=6"]) == 0
+    picture = ["foresight", f"--policy_path={run / last}", f"--output={tmp_path / 'f.png'}", "--num_steps=6"]
+    assert main(picture) == 1  # this one has nothing to remember yet when the trial ends
+    assert "never surprised" in capsys.readouterr().err
+    config = json.loads((run / last / "config.json").read_text())
+    (run / last / "config.json").write_text(json.dumps(config | {"recall": False}))
+    assert main(picture) == 0
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+
+    flags = [f"--policy_paths=[{run / last}]", f"--dataset_dir={demonstrations}"]
+    assert main(["lyapunov", *flags, f"--output={tmp_path / 'l.png'}", "--horizon=1"]) == 0
+    rows = (tmp_path / "l.csv").read_text().splitlines()
+    assert len(rows) == 1 + 3 * 100
+    assert rows[1].startswith("UF-RNN,0,0,")
+    hidden = [*flags, f"--output={tmp_path / 'h.png'}", "--num_steps=6", "--kind=pull", "--hold_seconds=3"]
+    assert main(["hidden", *hidden]) == 0
+    rows = (tmp_path / "h.csv").read_text().splitlines()
+    assert len(rows) == 1 + 3 * 100 + 6
+    assert [row.split(",")[2] for row in rows[1::100]] == ["push", "pull", "slide", "pull"]
+    assert main(["hidden", f"--policy_paths=[{run / last},{run / last}]", f"--dataset_dir={demonstrations}"]) == 1
+
+
+def test_phases_begin_where_the_expert_planned_them(demonstrations):
+    starts = phase_starts(read_provenance(demonstrations))
+    dataset = LeRobotDataset("test/door", root=demonstrations, video_backend="pyav")
+    actions = np.stack(dataset.hf_dataset["action"]).reshape(3, 100, -1)
+    closing = (actions[0, :, -1] > 0).argmax()
+    parting = (abs(actions[0] - actions[1]).max(-1) > 1e-6).argmax()
+    assert starts["grasp"] == [closing]
+    assert starts["open"] == [parting]
+    assert starts["grasp"] < starts["twist"] < starts["open"]
 
 
 def test_an_interruption_leaves_with_the_usual_status(monkeypatch, capsys):
