@@ -1,5 +1,6 @@
 """One model trained with one seed, and the evaluations of its checkpoints."""
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,13 +47,19 @@ class Chain:
         return f"{self.model.name}, seed {self.train_seed}"
 
     @property
+    def label(self) -> str:
+        """`str`: what the table calls the model as it is tried."""
+        variant = self.protocol.variant
+        return f"{self.model.name}+{variant}" if variant else self.model.name
+
+    @property
     def training(self) -> str:
         """`str`: what to call its training."""
         return f"{self.name}: training"
 
     def evaluation(self, epoch: int) -> str:
         """`str`: what to call the evaluation of an epoch."""
-        return f"{self.name}: evaluation of epoch {epoch}"
+        return f"{self.label}, seed {self.train_seed}: evaluation of epoch {epoch}"
 
     @property
     def folder(self) -> Path:
@@ -127,9 +134,11 @@ class Chain:
         """
         folder = self._evaluation_folder(epoch)
         state = folder.with_name(f"{folder.name}.json")
-        run_once(self.evaluation(epoch), state, {}, partial(self._evaluate, epoch, runner, lock))
+        run_once(
+            self.evaluation(epoch), state, self.protocol.policy_flags, partial(self._evaluate, epoch, runner, lock)
+        )
         doors = summarize(self._trials(epoch))
-        rows = rows_of(self.protocol.row_type, self.model.name, self.train_seed, epoch, doors)
+        rows = rows_of(self.protocol.row_type, self.label, self.train_seed, epoch, doors)
         add_to_table(self.protocol.table, rows)
 
     def _evaluation_folder(self, epoch: int) -> Path:
@@ -186,6 +195,7 @@ class Chain:
                 "--eval.use_async_envs=false",
                 f"--output_dir={folder}",
                 f"--seed={self.protocol.trial_seed}",
+                *(f"--policy.{name}={json.dumps(value)}" for name, value in self.protocol.policy_flags.items()),
             ],
             folder.with_name(f"{folder.name}.log"),
             lock,

@@ -1,5 +1,6 @@
 """What to compare: the options of `ufrnn protocol`."""
 
+import string
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from ..analysis.interference_table import InterferenceRow
 from ..analysis.protocol_table import ProtocolRow
 
 EXECUTORS = ("local", "slurm")
+NAME_CHARACTERS = set(string.ascii_letters + string.digits + "_-")
 DEMONSTRATED = ("kinds", "episodes_per_kind", "num_steps", "door_offset")
 """Options that choose the demonstrations to record."""
 
@@ -38,6 +40,11 @@ class ProtocolConfig:
         hold_seconds (`float`, *optional*, defaults to `0.0`):
             Interference: time in seconds, 0 to 20, for which somebody holds the door of a trial still once it has begun
             to open.
+        variant (`str`, *optional*):
+            Name of what `policy_flags` change, in the table `<model>+<variant>`.
+        policy_flags (`dict[str, Any]`, *optional*):
+            Fields of the policy's configuration to change in the trials only, such as `{recall: false}`: an ablation of
+            what needs no other training. Needs a `variant`.
         kinds (`tuple[str, ...]`, *optional*, defaults to `("push", "pull", "slide")`):
             Kinds of door, in demonstrations and trials.
         episodes_per_kind (`int`, *optional*, defaults to `5`):
@@ -74,6 +81,8 @@ class ProtocolConfig:
     trials_per_kind: int = 100
     trial_seed: int = 10000
     hold_seconds: float = 0.0
+    variant: str = ""
+    policy_flags: dict[str, Any] = field(default_factory=dict)
     kinds: tuple[str, ...] = KINDS
     episodes_per_kind: int = 5
     num_steps: int = 150
@@ -108,6 +117,11 @@ class ProtocolConfig:
                 raise ValueError(f"--{name} must be at least {least}, got {getattr(self, name)}.")
         if not self.kinds or sorted(self.kinds) != sorted(set(self.kinds) & set(KINDS)):
             raise ValueError(f"--kinds must be one or more of {list(KINDS)}, each once, got {list(self.kinds)}.")
+        if bool(self.variant) != bool(self.policy_flags) or not set(self.variant) <= NAME_CHARACTERS:
+            raise ValueError(
+                "--variant must name --policy_flags in letters, digits, '_' and '-', and neither goes without the "
+                f"other; got {self.variant!r} and {self.policy_flags}."
+            )
         if not 0 <= self.hold_seconds <= MAX_HOLD:
             raise ValueError(f"--hold_seconds must be 0 to {MAX_HOLD} s, got {self.hold_seconds}.")
         if not 0 <= self.door_offset <= MAX_OFFSET:
@@ -145,4 +159,6 @@ class ProtocolConfig:
             name += f"_{'_'.join(self.kinds)}"
         if self.hold_seconds > 0:
             name += f"_held_{self.hold_seconds:g}"
+        if self.variant:
+            name += f"_{self.variant}"
         return name

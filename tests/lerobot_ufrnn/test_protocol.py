@@ -226,6 +226,18 @@ def test_trials_with_a_held_door_go_to_a_table_of_their_own(protocol):
     assert protocol.results.read_text() == undisturbed
 
 
+def test_a_variant_tries_the_same_training_with_other_settings(protocol):
+    run_chain(chain_of(protocol), FakeRunner())
+    varied = replace(protocol, variant="blind", policy_flags={"recall": False, "recall_noise": [0.1, 0.2]})
+    runner = FakeRunner()
+    assert run_chain(chain_of(varied), runner) == []
+    assert [name for name, _ in runner.commands] == ["lerobot-eval"] * 2
+    assert {"policy.recall": "false", "policy.recall_noise": "[0.1, 0.2]"}.items() <= runner.commands[0][1].items()
+    labels = [line.split(",")[0] for line in protocol.results.read_text().splitlines()]
+    assert (labels.count("one"), labels.count("one+blind")) == (6, 6)
+    assert run_chain(chain_of(replace(varied, policy_flags={"recall": True})), FakeRunner()) != []
+
+
 def test_each_kind_of_trial_has_its_table():
     assert ProtocolConfig([Path("one.yaml")]).table == Path("results/door_protocol.csv")
     assert ProtocolConfig([Path("one.yaml")], hold_seconds=3.0).table == Path("results/door_interference.csv")
@@ -375,6 +387,8 @@ def test_an_interruption_stops_the_commands(protocol, monkeypatch):
         (["--kinds=[]"], "--kinds must be one or more of"),
         (["--num_steps=0"], "--num_steps must be at least 1, got 0"),
         (["--kinds=[push]", "--num_steps=9", "--results=null"], "with --kinds and --num_steps give it a table of its"),
+        (["--variant=blind"], "neither goes without the other; got 'blind' and {}"),
+        (["--variant=a/b", "--policy_flags={{recall: false}}"], "in letters, digits, '_' and '-'"),
         (["--executor=pbs"], "--executor must be one of ['local', 'slurm'], got 'pbs'"),
         (["--dataset_dir={tmp}"], "is not a LeRobotDataset"),
     ],
