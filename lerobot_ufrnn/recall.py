@@ -197,16 +197,18 @@ class Recall:
             deaf = torch.tensor([[episode.deaf > 0] for episode in self._episodes], device=inputs.device)
             inputs = torch.where(deaf, memory.prediction.mean, inputs)
         after, trace = self.model.advance(inputs, memory, generator)
-        replaced = False
-        state = after.state
+        replacements = {}
         for row, episode in enumerate(self._episodes):
             other = self._follow(episode, surprises[row], _row(after.state, row), generator)
             if other is not None:
-                if not replaced:
-                    state, replaced = HiddenState(*(values.clone() for values in state)), True
-                for values, new in zip(state, other, strict=True):
-                    values[row] = new[0]
-        return (Memory(state, self.model.network.predict(state)) if replaced else after), trace
+                replacements[row] = other
+        if not replacements:
+            return after, trace
+        state = HiddenState(*(values.clone() for values in after.state))
+        for row, other in replacements.items():
+            for values, new in zip(state, other, strict=True):
+                values[row] = new[0]
+        return Memory(state, self.model.network.predict(state)), trace
 
     def _follow(
         self, episode: _Episode, now: float, state: HiddenState, generator: Generator | None
@@ -273,11 +275,7 @@ class Recall:
         # Its own present must be ours: a copy that believes itself elsewhere is uncertain, whatever it predicts.
         cost = uncertainty(futures.log_variance[-1], joint_dim, "variance")
         cost = cost + (network.predict_mean(begun)[:, :joint_dim] - present).square().mean(-1)
-        # Those that are neither refuted nor accidental by their cost; if there are none, the least refuted.
-        closed = (refuted >= REFUTED) | accidental
-        if closed.all():
-            cost, closed = refuted, accidental
-        chosen = int(cost.masked_fill(closed, math.inf).argmin())
+        chosen = _choose(cost, refuted, accidental)
         episode.plan, episode.tried = _row(begun, chosen), ends[chosen]
         kept = futures if self.keep_futures else None
         episode.events.append(RecallEvent(episode.step, steps_back, refuted, chosen, kept))
@@ -292,6 +290,16 @@ class Recall:
             std = low + (high - low) * torch.rand(1, generator=generator, dtype=like.dtype, device=like.device)
         noise = sample_noise(anchor, self.num_samples, self.perturbed, generator=generator) * std[:, None, None]
         return perturb(anchor, noise, like.new_ones(1, 2), self.perturbed)
+
+
+def _choose(cost: Tensor, refuted: Tensor, accidental: Tensor) -> int:
+    """The least costly future that is neither refuted nor accidental; if there is none, the least refuted."""
+    if accidental.all():
+        accidental = torch.zeros_like(accidental)  # then none is more so than another
+    closed = accidental | (refuted >= REFUTED)
+    if closed.all():
+        cost, closed = refuted, accidental
+    return int(cost.masked_fill(closed, math.inf).argmin())
 
 
 def _row(state: HiddenState, row: int) -> HiddenState:

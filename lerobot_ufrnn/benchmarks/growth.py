@@ -119,11 +119,11 @@ def measure_growth(
 
 def _pass(problem: Problem) -> Callable[[], None]:
     model = problem.make_model()
-    inputs, targets = problem.make_episodes()
+    episodes = problem.make_episodes()
     generator = torch.Generator().manual_seed(0)
 
     def forward_and_backward() -> None:
         model.zero_grad()
-        torch_loss(model, inputs, targets, generator).backward()
+        torch_loss(model, *episodes, generator).backward()
 
     return forward_and_backward

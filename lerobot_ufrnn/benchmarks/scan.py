@@ -130,21 +130,29 @@ def _variances(w: _Packed, lower: jax.Array, sizes: ScanSizes) -> jax.Array:
     return jnp.stack((variance[..., : sizes.joint_dim].mean(-1), variance[..., sizes.joint_dim :].mean(-1)), axis=-1)
 
 
+def _nll(values: jax.Array, mean: jax.Array, log_variance: jax.Array) -> jax.Array:
+    """Gaussian NLL, summed over the dimensions."""
+    return 0.5 * ((values - mean) ** 2 * jnp.exp(-log_variance) + log_variance + np.log(2 * np.pi)).sum(-1)
+
+
 def loss(
     parameters: Parameters,
     inputs: jax.Array,
     targets: jax.Array,
+    commands: jax.Array,
     noise: jax.Array,
     noise_bounds: jax.Array,
     sizes: ScanSizes,
 ) -> tuple[jax.Array, jax.Array]:
-    """Mean Gaussian NLL of whole episodes.
+    """Mean Gaussian NLL of the sensor values and the commands of whole episodes.
 
     Args:
         parameters (`Parameters`):
             Parameters under the names of `SHLSTM`.
         inputs (`jax.Array`), targets (`jax.Array`):
             Episodes, (L, B, D).
+        commands (`jax.Array`):
+            What is commanded in them, (L, B, D_j).
         noise (`jax.Array`):
             Standard normal numbers, (L, N, B, hidden sizes).
         noise_bounds (`jax.Array`):
@@ -204,8 +212,10 @@ def loss(
     _, (lower, chosen) = lax.scan(step, start, (from_inputs, noise))
     mean = jnp.tanh(lower @ weights.mean + weights.mean_bias)
     log_variance = _log_variance(weights, lower, sizes)
-    nll = 0.5 * ((targets - mean) ** 2 * jnp.exp(-log_variance) + log_variance + np.log(2 * np.pi))
-    return nll.sum(-1).mean(), chosen
+    command_weight = parameters["command_head.weight"].T
+    command = jnp.tanh(lower[..., : sizes.joint_hidden] @ command_weight + parameters["command_head.bias"])
+    nll = _nll(targets, mean, log_variance) + _nll(commands, command, log_variance[..., : sizes.joint_dim])
+    return nll.mean(), chosen
 
 
 loss_and_gradients = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames="sizes")
@@ -234,6 +244,7 @@ def update(
     state: AdamState,
     inputs: jax.Array,
     targets: jax.Array,
+    commands: jax.Array,
     noise: jax.Array,
     noise_bounds: jax.Array,
     sizes: ScanSizes,
@@ -245,7 +256,9 @@ def update(
     Args:
         state (`AdamState`):
             Parameters and moments; its memory is used again.
-        inputs (`jax.Array`), targets (`jax.Array`), noise (`jax.Array`), noise_bounds (`jax.Array`):
+        inputs (`jax.Array`), targets (`jax.Array`), commands (`jax.Array`):
+            See `loss`.
+        noise (`jax.Array`), noise_bounds (`jax.Array`):
             See `loss`.
         sizes (`ScanSizes`):
             See `loss`.
@@ -258,7 +271,7 @@ def update(
         `tuple[AdamState, jax.Array]`: the next state, and the loss before the update.
     """
     (value, _), gradients = jax.value_and_grad(loss, has_aux=True)(
-        state.parameters, inputs, targets, noise, noise_bounds, sizes
+        state.parameters, inputs, targets, commands, noise, noise_bounds, sizes
     )
     norm = jnp.sqrt(sum(jnp.vdot(gradient, gradient) for gradient in gradients.values()))
     scale = jnp.minimum(1.0, clip_norm / (norm + 1e-6))

@@ -38,6 +38,7 @@ PAPER: dict[str, Any] = {
     "image_hidden_dim": 50,
     "shared_hidden_dim": 20,
     "feature_dim": 10,
+    "command_target": "action",
 }
 FAST, REFERENCE, SCAN = "fast kernel", "reference", "XLA scan"
 
@@ -74,12 +75,13 @@ class Problem:
         schedule.observe(torch.tensor([[0.5, 0.5], [1.5, 1.5]]))
         return kernel(network, Foresight(config.exploration, schedule, config.num_samples, config.horizon))
 
-    def make_episodes(self) -> tuple[Tensor, Tensor]:
-        """Smooth random inputs and their next values as targets, (B, L, D) each."""
+    def make_episodes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Smooth random inputs and their next values, (B, L, D) each, and commands a step ahead, (B, L, D_j)."""
         generator = torch.Generator().manual_seed(0)
         phase = 2 * torch.pi * torch.rand(self.batch_size, 1, self._dim, generator=generator)
-        values = 0.8 * torch.sin(0.1 * torch.arange(self.length + 1)[None, :, None] + phase)
-        return values[:, :-1].contiguous(), values[:, 1:].contiguous()
+        values = 0.8 * torch.sin(0.1 * torch.arange(self.length + 2)[None, :, None] + phase)
+        inputs, targets, commands = values[:, :-2], values[:, 1:-1], values[:, 2:, : self.joint_dim]
+        return inputs.contiguous(), targets.contiguous(), commands.contiguous()
 
     @property
     def scan_sizes(self) -> "ScanSizes":
@@ -103,22 +105,24 @@ class Problem:
         return self.joint_dim + self.config.feature_dim
 
 
-def torch_loss(model: UFRNN, inputs: Tensor, targets: Tensor, generator: torch.Generator) -> Tensor:
+def torch_loss(model: UFRNN, inputs: Tensor, targets: Tensor, commands: Tensor, generator: torch.Generator) -> Tensor:
     """Loss of the recurrent network's training, without what is only logged."""
     prediction, _ = model(inputs, generator)
-    return gaussian_nll(targets, prediction.mean, prediction.log_variance).sum(-1).mean()
+    nll = gaussian_nll(targets, prediction.mean, prediction.log_variance).sum(-1)
+    joint_log_variance = prediction.log_variance[..., : model.network.joint_dim]
+    return (nll + gaussian_nll(commands, prediction.command, joint_log_variance).sum(-1)).mean()
 
 
 def make_torch_update(problem: Problem, kernel: type[UFRNN]) -> Callable[[], object]:
     """One update with PyTorch's optimiser, as `lerobot-train` makes it."""
     model = problem.make_model(kernel)
-    inputs, targets = problem.make_episodes()
+    episodes = problem.make_episodes()
     preset = problem.config.get_optimizer_preset()
     optimizer = preset.build(list(model.parameters()))
     generator = torch.Generator().manual_seed(0)
 
     def update() -> float:
-        loss = torch_loss(model, inputs, targets, generator)
+        loss = torch_loss(model, *episodes, generator)
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), preset.grad_clip_norm)
@@ -137,7 +141,7 @@ def make_scan_update(problem: Problem) -> Callable[[], object]:
     from . import scan
 
     config, model = problem.config, problem.make_model(UFRNN)
-    inputs, targets = (scan.jnp.array(values.transpose(0, 1).numpy()) for values in problem.make_episodes())
+    episodes = [scan.jnp.array(values.transpose(0, 1).numpy()) for values in problem.make_episodes()]
     state = scan.start_adam({name: value.detach().numpy() for name, value in model.network.named_parameters()})
     schedule = model.foresight.schedule
     noise_bounds = scan.jnp.array(np.stack((schedule.low.numpy(), schedule.high.numpy())))
@@ -149,7 +153,7 @@ def make_scan_update(problem: Problem) -> Callable[[], object]:
         nonlocal state
         noise = torch.randn(shape, generator=generator).numpy()
         state, loss = scan.update(
-            state, inputs, targets, noise, noise_bounds, sizes, config.optimizer_lr, config.optimizer_grad_clip_norm
+            state, *episodes, noise, noise_bounds, sizes, config.optimizer_lr, config.optimizer_grad_clip_norm
         )
         return float(loss)
 

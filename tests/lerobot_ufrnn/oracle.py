@@ -40,7 +40,10 @@ class Oracle:
         raw = np.concatenate([joint[j : 2 * j], image[f : 2 * f]])
         raw = self.high - np.log1p(np.exp(self.high - raw))
         log_variance = self.low + np.log1p(np.exp(raw - self.low))
-        return mean, log_variance, np.array([joint[-1], image[-1]])
+        command = mean[:j]
+        if "command_head.weight" in self.weights:
+            command = np.tanh(self.weights["command_head.weight"] @ state[0] + self.weights["command_head.bias"])
+        return mean, log_variance, np.array([joint[-1], image[-1]]), command
 
     def uncertainty(self, log_variance, aggregation):
         values = log_variance if aggregation == "entropy" else np.exp(log_variance)
@@ -50,7 +53,6 @@ class Oracle:
         """Predictions after each closed-loop step."""
         futures = []
         for _ in range(horizon):
-            mean, _, _ = self.predict(state)
-            state = self.step(mean, state)
+            state = self.step(self.predict(state)[0], state)
             futures.append(self.predict(state))
         return futures

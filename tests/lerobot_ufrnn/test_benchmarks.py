@@ -37,20 +37,19 @@ def test_the_scan_computes_what_the_reference_computes(problem):
     model = problem.make_model(UFRNN).double()
     for parameter in model.parameters():  # larger weights than at the start, so that candidates part
         parameter.data.mul_(2)
-    inputs, targets = (values.double() for values in problem.make_episodes())
-    _, trace = model(inputs, torch.Generator().manual_seed(3))
+    episodes = [values.double() for values in problem.make_episodes()]
+    _, trace = model(episodes[0], torch.Generator().manual_seed(3))
     assert trace is not None
     generator = torch.Generator().manual_seed(3)
     noise = torch.stack(
         [model.foresight.sample_noise(model.network.initial_state(3), generator) for _ in range(problem.length)]
     )
-    expected = torch_loss(model, inputs, targets, torch.Generator().manual_seed(3))
+    expected = torch_loss(model, *episodes, torch.Generator().manual_seed(3))
     expected.backward()
     with scan.jax.enable_x64(True):
         (value, chosen), gradients = scan.loss_and_gradients(
             {name: weight.detach().numpy() for name, weight in model.network.named_parameters()},
-            inputs.transpose(0, 1).numpy(),
-            targets.transpose(0, 1).numpy(),
+            *(values.transpose(0, 1).numpy() for values in episodes),
             noise.numpy(),
             np.stack((model.foresight.schedule.low.numpy(), model.foresight.schedule.high.numpy())),
             sizes=problem.scan_sizes,

@@ -71,7 +71,7 @@ def oracle_foresight(network, schedule, state, previous, noise, settings_):
                 if name in noise:
                     vector = vector + scale[name[2:]] * noise[name][n, row].numpy()
                 candidate.append(vector)
-            _, own_log_variance, step = oracle.predict(candidate)
+            _, own_log_variance, step, _ = oracle.predict(candidate)
             horizon = settings_["horizon"]
             if settings_.get("learned_horizon"):
                 horizon = int(np.ceil(horizon * (1 / (1 + np.exp(-step))).max()))
@@ -144,7 +144,7 @@ def test_roll_out_feeds_the_predicted_means_back():
     foresight = Foresight("foresight", make_schedule(), num_samples=1, horizon=4)
     kept, trace = foresight(network, state, previous, torch.Generator().manual_seed(1))
     futures = Oracle(network).imagine([value[1].detach().numpy() for value in kept], 4)
-    for step, (mean, log_variance, _) in enumerate(futures):
+    for step, (mean, log_variance, *_) in enumerate(futures):
         np.testing.assert_allclose(trace.imagined.mean[step, 0, 1].numpy(), mean, atol=1e-12)
         np.testing.assert_allclose(trace.imagined.log_variance[step, 0, 1].numpy(), log_variance, atol=1e-12)
 

@@ -23,10 +23,12 @@ from lerobot_ufrnn.recurrent import UFRNN
 sizes = st.integers(1, 20)
 
 
-def make_pair(dims, seed, dtype=torch.float64, gain=2.0, schedule=None, **foresight) -> tuple[UFRNN, FastUFRNN]:
+def make_pair(
+    dims, seed, dtype=torch.float64, gain=2.0, schedule=None, command_head=True, **foresight
+) -> tuple[UFRNN, FastUFRNN]:
     """The same model twice: readable and compiled."""
     torch.manual_seed(seed)
-    network = SHLSTM(*dims, (-9.0, 3.0))
+    network = SHLSTM(*dims, (-9.0, 3.0), command_head)
     for parameter in network.parameters():  # larger weights than at the start, so that candidates part
         parameter.data.mul_(gain)
     noise = NoiseSchedule(**{"noise_range": (0.05, 0.15), "noise_unit": "std", "log_scale": False, **(schedule or {})})
@@ -45,6 +47,7 @@ def run(model, inputs, seed):
     prediction, trace = model(leaf, torch.Generator().manual_seed(seed))
     target = inputs.roll(-1, dims=1)
     loss = gaussian_nll(target, prediction.mean, prediction.log_variance).mean() + prediction.step.square().mean()
+    loss = loss + (target[..., : model.network.joint_dim] - prediction.command).square().mean()
     loss.backward()
     gradients = {name: value.grad.clone() for name, value in model.named_parameters()}
     return prediction, trace, loss.detach(), {**gradients, "inputs": leaf.grad}
@@ -69,6 +72,7 @@ def named(name):
     keep_unperturbed=st.booleans(),
     noise_unit=st.sampled_from(["variance", "std"]),
     log_scale=st.booleans(),
+    command_head=st.booleans(),
     seed=st.integers(0, 1000),
 )
 def test_forward_loss_gradients_and_choices_equal_the_reference(

@@ -1,4 +1,5 @@
 import threading
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,13 +11,17 @@ from small import batch_of, make_dataset, observation, small_config, train
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
 
 
+def make_trained(dataset, **overrides) -> UFRNNPolicy:
+    torch.manual_seed(0)
+    policy = make_policy(small_config(**overrides), ds_meta=dataset.meta)
+    train(policy, [batch_of(0, 1, 2)] * 5)
+    return policy.eval()
+
+
 @pytest.fixture
 def trained(dataset) -> UFRNNPolicy:
     """A policy that has been through both phases."""
-    torch.manual_seed(0)
-    policy = make_policy(small_config(), ds_meta=dataset.meta)
-    train(policy, [batch_of(0, 1, 2)] * 5)
-    return policy.eval()
+    return make_trained(dataset)
 
 
 # ── Acting ────────────────────────────────────────────────────────────
@@ -53,16 +58,15 @@ def test_reset_forgets_the_episode(trained):
     torch.testing.assert_close(trained.select_action(observation()), first)
 
 
-def test_a_command_fed_back_means_the_same_as_a_measurement(trained):
+def test_a_command_fed_back_means_the_same_as_a_measurement(dataset):
     """An arm that follows its command exactly measures what the network predicted: closed loop = imagination."""
-    trained.model.foresight.exploration = "none"
-    trained.select_action(observation(1))
-    imagined = Oracle(trained.model.network).imagine([value[0].numpy() for value in trained.memory.state], 1)[0][0]
-    mean = trained.memory.prediction.mean
-    action = trained.joint_scaler.unscale(mean[:, :3])
-    torch.testing.assert_close(trained.joint_scaler.scale(action), mean[:, :3], atol=1e-6, rtol=0)
-    inputs = torch.cat((trained.joint_scaler.scale(action), mean[:, 3:]), dim=-1)
-    memory, _ = trained.model.advance(inputs, trained.memory)
+    policy = make_trained(dataset, command_target="next_state", exploration="none")
+    action = policy.select_action(observation(1))
+    imagined = Oracle(policy.model.network).imagine([value[0].numpy() for value in policy.memory.state], 1)[0][0]
+    mean = policy.memory.prediction.mean
+    torch.testing.assert_close(policy.joint_scaler.scale(action), mean[:, :3], atol=1e-6, rtol=0)
+    inputs = torch.cat((policy.joint_scaler.scale(action), mean[:, 3:]), dim=-1)
+    memory, _ = policy.model.advance(inputs, policy.memory)
     torch.testing.assert_close(
         memory.prediction.mean[0], torch.tensor(imagined, dtype=torch.float32), atol=1e-5, rtol=0
     )
@@ -87,9 +91,10 @@ def test_the_pipelines_leave_values_alone(trained, dataset):
     assert torch.equal(postprocess(action), action)
 
 
-def test_foresight_shows_what_it_saw(trained):
-    trained.select_action(observation(2))
-    trace = trained.last_trace
+def test_foresight_shows_what_it_saw(dataset):
+    policy = make_trained(dataset, recall=False)
+    policy.select_action(observation(2))
+    trace = policy.last_trace
     with pytest.raises(RuntimeError, match="kernel='reference'"):
         _ = trace.imagined
     assert trace.final.shape == (3, 2)
@@ -98,15 +103,35 @@ def test_foresight_shows_what_it_saw(trained):
 
 def test_the_baselines_run_in_the_same_code(dataset):
     for exploration in ("noise", "none"):
-        policy = make_policy(small_config(exploration=exploration), ds_meta=dataset.meta)
-        train(policy, [batch_of(0, 1)] * 4)
-        policy.eval().reset()
+        policy = make_trained(dataset, exploration=exploration, recall=False)
         first, second = (policy.select_action(observation()) for _ in range(2))
         policy.reset()
         repeated = policy.select_action(observation())
         assert policy.last_trace is None
         assert torch.equal(first, repeated) == (exploration == "none")
         assert not torch.equal(first, second)
+
+
+@pytest.mark.parametrize("exploration", ["foresight", "noise", "none"])
+def test_with_recall_a_policy_that_is_never_surprised_acts_without_noise(dataset, exploration):
+    calm = make_trained(dataset, exploration=exploration, surprise_threshold=1e30)
+    plain = make_trained(dataset, exploration="none", recall=False)
+    plain.load_state_dict(calm.state_dict())
+    for _ in range(15):
+        assert torch.equal(calm.select_action(observation()), plain.select_action(observation()))
+    assert calm.last_trace is None
+    assert calm.recall.events == [[], []]
+
+
+def test_with_recall_a_surprised_policy_goes_back_until_it_is_reset(dataset):
+    policy = make_trained(dataset, surprise_threshold=1.01, recall_rewind=1, recall_samples=5)
+    far = observation(1)
+    far["observation.state"] += 5
+    for _ in range(20):
+        assert torch.isfinite(policy.select_action(far)).all()
+    assert policy.recall.events[0]
+    policy.reset()
+    assert not policy.recall.events
 
 
 def bad_observations():
@@ -164,8 +189,9 @@ def test_an_untrained_policy_says_so(dataset):
         policy.select_action(observation())
 
 
-def test_a_policy_whose_weights_are_nan_sends_nothing_to_the_robot(trained):
-    trained.model.network.joint_head.bias.data.fill_(float("nan"))
+@pytest.mark.parametrize("name", ["joint_head.bias", "command_head.bias", "image_cell.weight_ih"])
+def test_a_policy_whose_weights_are_nan_sends_nothing_to_the_robot(trained, name):
+    trained.model.network.get_parameter(name).data.fill_(float("nan"))
     with pytest.raises(RuntimeError, match="its weights are broken"):
         trained.select_action(observation())
 
@@ -233,14 +259,32 @@ def test_targets_are_the_next_sensor_values(dataset):
     policy = make_policy(small_config(), ds_meta=dataset.meta)
     train(policy, [batch_of(0, 1, 2)] * 3)
     policy.eval()
-    episode = policy.episodes[1]
-    inputs, targets = policy._input_target(episode)
+    episode = replace(policy.episodes[1], actions=torch.rand(12, 3))
+    inputs, targets, commands = policy._sequence(episode)
     assert inputs.shape == targets.shape == (11, 7)
-    torch.testing.assert_close(policy.joint_scaler.unscale(targets[:, :3]), episode.actions[:-1])
-    torch.testing.assert_close(targets[:-1, 3:], inputs[1:, 3:])
-    policy.config.joint_target = "next_state"
-    _, targets = policy._input_target(episode)
-    torch.testing.assert_close(targets[:-1, :3], inputs[1:, :3])
+    assert torch.equal(targets[:-1], inputs[1:])
+    torch.testing.assert_close(policy.joint_scaler.unscale(inputs[:, :3]), episode.states[:-1])
+    torch.testing.assert_close(policy.joint_scaler.unscale(targets[:, :3]), episode.states[1:])
+    torch.testing.assert_close(policy.joint_scaler.unscale(commands), episode.actions[:-1])
+
+
+def test_commands_that_lead_nowhere_near_are_learned_all_the_same(tmp_path):
+    """A gripper that squeezes is commanded far from where it will be measured."""
+
+    def squeeze(frame, step):
+        return {**frame, "action": -frame["action"]}
+
+    data = make_dataset(tmp_path / "data", (12, 12), broken={0: squeeze, 1: squeeze})
+    errors = {}
+    for target in ("action", "next_state"):
+        torch.manual_seed(0)
+        policy = make_policy(small_config(optimizer_lr=1e-2, command_target=target), ds_meta=data.meta)
+        train(policy, [batch_of(0, 1)] * 100)
+        errors[target] = policy.eval().forward(batch_of(0, 1))[1]
+    # Commanding the next state is off by twice its size: a sine of amplitude 0.8 has a root mean square of 0.57.
+    assert errors["next_state"]["command_rmse"] > 0.9
+    assert errors["action"]["command_rmse"] < 0.3
+    assert errors["action"]["joint_rmse"] < 0.3
 
 
 def test_each_episode_is_one_item_of_the_sampler(dataset, uneven_dataset):
@@ -285,7 +329,7 @@ def test_a_resumed_training_ends_with_the_same_weights(dataset, tmp_path):
 
 
 def test_a_learned_horizon_trains_its_step_heads(dataset):
-    policy = make_policy(small_config(horizon_mode="learned", horizon=6), ds_meta=dataset.meta)
+    policy = make_policy(small_config(horizon_mode="learned", horizon=6, recall=False), ds_meta=dataset.meta)
     before = policy.model.network.joint_head.bias[-1].item()
     train(policy, [batch_of(0, 1, 2)] * 6)
     assert policy.model.network.joint_head.bias[-1].item() != before

@@ -1,17 +1,19 @@
 import numpy as np
+import pytest
 import torch
 from oracle import Oracle
 
 from lerobot_ufrnn.networks import SHLSTM
 
 
-def make_network() -> SHLSTM:
+def make_network(command_head: bool = True) -> SHLSTM:
     torch.manual_seed(0)
-    return SHLSTM(3, 4, 6, 5, 2, (-9.0, 3.0)).double()
+    return SHLSTM(3, 4, 6, 5, 2, (-9.0, 3.0), command_head).double()
 
 
-def test_steps_and_predictions_equal_the_oracle():
-    network = make_network()
+@pytest.mark.parametrize("command_head", [True, False])
+def test_steps_and_predictions_equal_the_oracle(command_head):
+    network = make_network(command_head)
     oracle = Oracle(network)
     inputs = torch.rand(9, 2, 7, dtype=torch.float64) * 1.6 - 0.8
     state = network.initial_state(2)
