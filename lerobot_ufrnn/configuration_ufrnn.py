@@ -62,7 +62,7 @@ class UFRNNConfig(PreTrainedConfig):
         recall (`bool`, *optional*, defaults to `True`):
             Whether acting goes back to a remembered state when the joints are not where they were predicted to be, and
             tries another future from there (see `recall.py`; not in the paper). Not used in training.
-        surprise_threshold (`float`, *optional*, defaults to `25.0`):
+        surprise_threshold (`float`, *optional*, defaults to `10.0`):
             Squared prediction error of the joints, in units of the predicted variance, from which to go back. It is one
             on average while all goes as foreseen.
         recall_rewind (`int`, *optional*, defaults to `8`):
@@ -154,7 +154,7 @@ class UFRNNConfig(PreTrainedConfig):
     keep_unperturbed: bool = False
 
     recall: bool = True
-    surprise_threshold: float = 25.0
+    surprise_threshold: float = 10.0
     recall_rewind: int = 8
     recall_samples: int = 96
     recall_noise: tuple[float, float] = (0.2, 1.5)

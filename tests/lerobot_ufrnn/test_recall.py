@@ -198,6 +198,18 @@ def test_it_waits_in_the_remembered_state_until_the_arm_is_back_but_not_for_ever
     assert_close(world.now.state, imagine(world.recall, anchor.state, COMMITMENT))
 
 
+def test_it_waits_as_long_each_time():
+    world = surprised_world()
+    for _ in range(2):
+        anchor = world.now.state
+        world.steps(LONGEST_RETURN - 1, CONTRADICTION)
+        assert_equal(world.now.state, anchor)
+        world.step(CONTRADICTION)
+        assert not torch.equal(world.now.state.h_joint, anchor.h_joint)
+        world.steps(COMMITMENT + SETTLING)
+        world.fail()
+
+
 @pytest.mark.parametrize("exploration", ["foresight", "noise", "none"])
 def test_a_chosen_future_is_carried_out_deaf_to_the_senses_and_then_it_listens(exploration):
     worlds = [surprised_world(exploration=exploration, noise_range=(0.2, 0.5)) for _ in range(2)]
@@ -292,12 +304,16 @@ def test_a_generator_makes_it_reproducible(exploration):
 # ── Choosing ──────────────────────────────────────────────────────────
 
 
+PRESENT = 0.5
+
+
 def script(monkeypatch, ends: list[float], variances: list[float]) -> None:
-    """Whatever is imagined, the first joint ends at one of `ends` and the others at 0, with these variances."""
+    """Whatever is imagined, the first joint ends by one of `ends` off `PRESENT`, with these variances."""
 
     def roll_out(network, state, horizon):
         mean, log_variance = torch.zeros(2, horizon, len(ends), JOINTS + FEATURES, dtype=torch.float64)
-        mean[-1, :, 0] = torch.tensor(ends)
+        mean[-1, :, :JOINTS] = PRESENT
+        mean[-1, :, 0] += torch.tensor(ends)
         log_variance[-1] = torch.tensor(variances).log()[:, None]
         nothing = mean.new_empty(horizon, len(ends), 0)
         return Prediction(mean, log_variance, nothing, nothing)
@@ -312,11 +328,12 @@ VARIANCES = [0.4, 0.4, 0.3, 0.4, 0.2, 0.2, 0.1, 0.2]
 
 
 def failing_world(monkeypatch, ends, variances, failures, **overrides) -> World:
-    """The joints are always predicted at 0, from where `ends` lead; every try fails."""
+    """The joints are always predicted at `PRESENT`; every try fails."""
     script(monkeypatch, ends, variances)
     world = World(make_recall(num_samples=len(ends), **overrides))
-    for parameter in world.recall.model.network.joint_head.parameters():
-        parameter.data[:JOINTS] = 0
+    head = world.recall.model.network.joint_head
+    head.weight.data[:JOINTS] = 0
+    head.bias.data[:JOINTS] = np.arctanh(PRESENT)
     world.steps(CALM_STEPS)
     world.fail()
     for _ in range(failures):
@@ -353,12 +370,25 @@ def test_without_memory_nothing_is_refuted(monkeypatch):
     assert not any(event.refuted.any() for event in world.events)
 
 
-def test_a_failure_fades_until_its_future_may_be_tried_again(monkeypatch):
-    """By a memory of 5 steps a failure is worth exp(-2) a try later, less than it takes to refute."""
-    world = failing_world(monkeypatch, TWO_WAYS, VARIANCES, failures=2, memory=5.0)
-    assert [event.chosen for event in world.events] == [6, 2, 6]
-    age = world.events[2].step - world.events[1].step
-    np.testing.assert_allclose(world.events[2].refuted[6].item(), np.exp(-age / 5), rtol=1e-6)
+@pytest.mark.parametrize(("memory", "third"), [(5.0, 6), (8.0, 8)])
+def test_a_failure_fades_until_its_future_may_be_tried_again(monkeypatch, memory, third):
+    """A try takes 8 steps; 0.3 is between exp(-8 / 5), which no longer refutes, and exp(-8 / 8), which does."""
+    third_way = [3.0] * 4
+    world = failing_world(monkeypatch, [*TWO_WAYS, *third_way], [*VARIANCES, *[0.9] * 4], failures=2, memory=memory)
+    assert [event.chosen for event in world.events] == [6, 2, third]
+    np.testing.assert_allclose(world.events[2].refuted[6].item(), np.exp(-8 / memory), rtol=1e-6)
+
+
+def test_it_goes_on_from_the_chosen_copy(monkeypatch):
+    script(monkeypatch, TWO_WAYS, [50 * variance for variance in VARIANCES])
+    world = World(make_recall(noise_range=(0.2, 0.5)), torch.Generator().manual_seed(3))
+    world.steps(CALM_STEPS)
+    world.fail()
+    (event,) = world.events
+    assert event.chosen == 6
+    copies = world.recall._perturb(world.now.state, torch.Generator().manual_seed(3))
+    world.step()
+    assert_close(world.now.state, imagine(world.recall, HiddenState(*(part[6:7] for part in copies)), COMMITMENT))
 
 
 def test_a_future_that_no_other_shares_is_not_chosen(monkeypatch):
