@@ -62,20 +62,19 @@ class UFRNNConfig(PreTrainedConfig):
         recall (`bool`, *optional*, defaults to `True`):
             Whether acting goes back to a remembered state when the joints are not where they were predicted to be, and
             tries another future from there (see `recall.py`; not in the paper). Not used in training.
-        surprise_threshold (`float`, *optional*, defaults to `10.0`):
-            Squared prediction error of the joints, in units of the predicted variance, from which to go back. It is one
-            on average while all goes as foreseen.
+        surprise_threshold (`float`, *optional*, defaults to `8.0`):
+            Squared prediction error of the joints, in units of the predicted variance, from which to go back, if the
+            arm does not move as foreseen. It is one on average while all goes as foreseen.
         recall_rewind (`int`, *optional*, defaults to `8`):
-            Steps to go back from the last unsurprised one.
-        recall_samples (`int`, *optional*, defaults to `96`):
-            Number of perturbed copies of the remembered state.
-        recall_noise (`tuple[float, float]`, *optional*, defaults to `(0.2, 1.5)`):
-            Standard deviation of the perturbation of the first and of the last copy; evenly spaced between.
-        recall_horizon (`int`, *optional*, defaults to `40`):
+            Remembered moments before the last unsurprised one of which perturbed copies are taken, too.
+        recall_samples (`int`, *optional*, defaults to `180`):
+            Number of perturbed copies.
+        recall_noise (`tuple[float, float]`, *optional*, defaults to `(1.0, 2.5)`):
+            Range of the standard deviation of the perturbation. Weaker noise leaves copies wavering between two ways.
+        recall_horizon (`int`, *optional*, defaults to `60`):
             Imagined steps by whose end the copies' futures are compared.
-        recall_commitment (`int`, *optional*, defaults to `6`):
-            First imagined steps, in which the perturbation settles, that are skipped, and as many after them that are
-            carried out without looking.
+        recall_commitment (`int`, *optional*, defaults to `24`):
+            Imagined steps that are carried out, at the arm's pace, before it listens to its senses again.
         recall_memory (`float`, *optional*, defaults to `200.0`):
             Steps in which the memory of a failed try fades to 1/e; 0 forgets at once.
 
@@ -154,12 +153,12 @@ class UFRNNConfig(PreTrainedConfig):
     keep_unperturbed: bool = False
 
     recall: bool = True
-    surprise_threshold: float = 10.0
+    surprise_threshold: float = 8.0
     recall_rewind: int = 8
-    recall_samples: int = 96
-    recall_noise: tuple[float, float] = (0.2, 1.5)
-    recall_horizon: int = 40
-    recall_commitment: int = 6
+    recall_samples: int = 180
+    recall_noise: tuple[float, float] = (1.0, 2.5)
+    recall_horizon: int = 60
+    recall_commitment: int = 24
     recall_memory: float = 200.0
 
     joint_hidden_dim: int = 50
@@ -210,7 +209,7 @@ class UFRNNConfig(PreTrainedConfig):
             *("conv_first_stride", "recall_samples", "recall_horizon"),
         ):
             self._require(name, getattr(self, name) >= 1, "at least 1")
-        for name in ("image_shift", "drop_n_last_frames", "recall_rewind"):
+        for name in ("image_shift", "drop_n_last_frames", "recall_rewind", "recall_commitment"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         for name in ("image_jitter", "image_noise", "input_noise"):
             self._require(name, 0 <= getattr(self, name) < 1, "from 0 to below 1")
@@ -218,11 +217,6 @@ class UFRNNConfig(PreTrainedConfig):
             self._require(name, 0 < getattr(self, name) < math.inf, "above 0")
         self._require("surprise_threshold", 1 < self.surprise_threshold < math.inf, "above 1")
         self._require("recall_memory", 0 <= self.recall_memory < math.inf, "at least 0")
-        self._require(
-            "recall_commitment",
-            0 <= self.recall_commitment < self.recall_horizon,
-            f"from 0 to below `recall_horizon` ({self.recall_horizon})",
-        )
         low, high = self._pair("recall_noise")
         self._require("recall_noise", 0 <= low <= high < math.inf, "two numbers with 0 <= low <= high")
         self._require("stall_probability", 0 <= self.stall_probability <= 1, "from 0 to 1")

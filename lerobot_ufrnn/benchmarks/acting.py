@@ -20,11 +20,12 @@ from .timing import Spread, collector_off, one_thread
 logger = logging.getLogger(__name__)
 
 NUM_JOINTS, IMAGE_SIZE, CAMERA = 7, 128, f"{OBS_IMAGES}.front"
-FAST, REFERENCE, ACT, DIFFUSION = "UF-RNN, fast kernel", "UF-RNN, reference", "ACT", "Diffusion Policy"
+FAST, REFERENCE = "UF-RNN, foresight at each step, fast kernel", "UF-RNN, foresight at each step, reference"
+RECALL, ACT, DIFFUSION = "UF-RNN, recall, going back whenever it can", "ACT", "Diffusion Policy"
 NUM_OBSERVATIONS = 16
 WARM_UP_TICKS, TICKS_AFTER_A_TURN = 10, 2
 CYCLE = 100
-"""Ticks of UF-RNN in one round; it plans anew at each."""
+"""Ticks of UF-RNN in one round. With foresight at each step it plans anew at each, with recall in a few of them."""
 
 
 @dataclass(frozen=True)
@@ -71,16 +72,18 @@ def make_features() -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]
     return inputs, {ACTION: PolicyFeature(FeatureType.ACTION, (NUM_JOINTS,))}
 
 
-def make_ufrnn(kernel: str) -> UFRNNPolicy:
-    """UF-RNN with default settings and random weights."""
+def make_ufrnn(kernel: str, recall: bool = False) -> UFRNNPolicy:
+    """UF-RNN with default settings and random weights; with recall so sure of itself that everything surprises it."""
     inputs, outputs = make_features()
     torch.manual_seed(0)
     bounds = {"min": -torch.ones(NUM_JOINTS), "max": torch.ones(NUM_JOINTS)}
-    config = UFRNNConfig(input_features=inputs, output_features=outputs, device="cpu", kernel=kernel)
+    config = UFRNNConfig(input_features=inputs, output_features=outputs, device="cpu", kernel=kernel, recall=recall)
     policy = UFRNNPolicy(config, dataset_stats={OBS_STATE: bounds, ACTION: bounds})
     scaler = policy.image_encoder.scaler
     scaler.fit(-torch.ones_like(scaler.low), torch.ones_like(scaler.high))
     policy.model.foresight.schedule.observe(torch.tensor([[0.5, 0.5], [1.5, 1.5]]))
+    if recall:
+        policy.model.network.joint_head.bias.data[NUM_JOINTS : 2 * NUM_JOINTS] = -100.0
     return policy.eval()
 
 
@@ -145,6 +148,7 @@ def measure_policies(
     policies: dict[str, tuple[PreTrainedPolicy, int]] = {
         FAST: (make_ufrnn("fast"), CYCLE),
         REFERENCE: (make_ufrnn("reference"), CYCLE),
+        RECALL: (make_ufrnn("fast", recall=True), CYCLE),
         ACT: (act, act.config.n_action_steps),
     }
     times = _measure(policies, seconds, min_rounds)
@@ -186,11 +190,12 @@ def _measure(
 
 
 def _observations() -> Iterator[dict[str, Tensor]]:
+    """An arm that does not move, which surprises a policy with recall, before changing images."""
     generator = torch.Generator().manual_seed(0)
     return itertools.cycle(
         [
             {
-                OBS_STATE: 2 * torch.rand(1, NUM_JOINTS, generator=generator) - 1,
+                OBS_STATE: torch.full((1, NUM_JOINTS), 0.5),
                 CAMERA: torch.rand(1, 3, IMAGE_SIZE, IMAGE_SIZE, generator=generator),
             }
             for _ in range(NUM_OBSERVATIONS)

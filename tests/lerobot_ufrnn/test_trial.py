@@ -80,7 +80,7 @@ def test_with_recall_what_is_imagined_is_kept_of_the_steps_that_surprised(datase
     assert events
     assert [imagined.step for imagined in history.imaginations] == [event.step for event in events]
     for imagined, event in zip(history.imaginations, events, strict=True):
-        assert imagined.futures.mean.shape[:2] == (3, policy.config.recall_samples)
+        assert imagined.futures.mean.shape[:2] == (9, policy.config.recall_samples)
         assert imagined.chosen == event.chosen
 
 
