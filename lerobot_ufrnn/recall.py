@@ -111,7 +111,7 @@ class Recall:
 
     The hidden state is perturbed when surprised and only then: noise at every step would look like a contradiction.
     With `exploration=foresight` futures are imagined and selected. The baselines go back too: `noise` goes on with any
-    one perturbed copy, `none` with a remembered state itself.
+    one perturbed copy, `none` with one of the moments itself.
 
     Args:
         model (`UFRNN`):

@@ -381,6 +381,15 @@ def test_who_has_finished_a_try_can_be_surprised_again_and_goes_back_to_after_it
     assert is_equal(world.now.state, world.memories[last_calm].state)
 
 
+def test_the_surprise_that_a_try_began_with_is_forgotten_with_its_end():
+    world = surprised_world()
+    world.finish()
+    world.step()
+    world.step(2 * THRESHOLD - 0.01)
+    world.steps(CALM_STEPS)
+    assert len(world.events) == 1
+
+
 def test_an_arm_that_is_blocked_goes_back_to_the_same_moment_and_tries_once_more():
     world = surprised_world(noise_range=(1.0, 2.0))
     for times in range(1, 4):
