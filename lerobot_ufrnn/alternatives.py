@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from .foresight import perturb, roll_out, sample_noise
+from .foresight import imagine_states, perturb, roll_out, sample_noise
 from .networks import SHLSTM, HiddenState, Prediction
 
 SETTLE = 6
@@ -77,12 +77,11 @@ class Alternatives:
         like, (low, high) = moments.h_joint, noise_range
         first = torch.randint(len(like), (1,), generator=generator, device=like.device)
         rows = (torch.arange(num_samples, device=like.device) + first) % len(like)
-        copies = HiddenState(*(values[rows] for values in moments))
+        copies = moments.rows(rows)
         std = low + (high - low) * torch.rand(num_samples, 1, generator=generator, dtype=like.dtype, device=like.device)
         noise = std * sample_noise(copies, 1, perturbed, generator=generator)
         begun = perturb(copies, noise, like.new_ones(num_samples, 2), perturbed)
-        for _ in range(SETTLE):
-            begun = network.step(network.predict_mean(begun), begun)
+        begun = imagine_states(network, begun, SETTLE)[-1]
         futures = roll_out(network, begun, horizon)
         starts = network.predict_mean(begun)[:, : network.joint_dim]
         return cls(begun, futures, starts, futures.mean[-1, :, : network.joint_dim])

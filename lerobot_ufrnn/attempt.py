@@ -5,6 +5,7 @@ from enum import Enum
 import torch
 from torch import Tensor
 
+from .foresight import imagine_states
 from .networks import SHLSTM, HiddenState
 
 LEAD = 8
@@ -65,11 +66,8 @@ class Attempt:
     """
 
     def __init__(self, network: SHLSTM, begun: HiddenState, steps: int, end: Tensor):
-        states = [begun]
-        for _ in range(steps):
-            states.append(network.step(network.predict_mean(states[-1]), states[-1]))
-        self._states = states
-        self._joints = torch.cat([network.predict_mean(state)[:, : network.joint_dim] for state in states])
+        self._states = imagine_states(network, begun, steps)
+        self._joints = torch.cat([network.predict_mean(state)[:, : network.joint_dim] for state in self._states])
         self._begun_at: Tensor | None = None
         self._at = -1  # the state that is carried out
         self._reached = 0  # the one whose joints the arm is nearest to

@@ -106,6 +106,26 @@ def perturb(state: HiddenState, noise: Tensor, noise_std: Tensor, perturbed: tup
     return HiddenState(*(candidates(name) for name in HiddenState._fields))
 
 
+def imagine_states(network: SHLSTM, state: HiddenState, num_steps: int) -> list[HiddenState]:
+    """Closed loop: a state and those that follow when the predicted means are fed back as inputs.
+
+    Args:
+        network (`SHLSTM`):
+            The network that imagines.
+        state (`HiddenState`):
+            Where to start from, (M, hidden size) each.
+        num_steps (`int`):
+            Number of steps T.
+
+    Returns:
+        `list[HiddenState]`: `state` and the state after each of the T steps, (M, hidden size) each.
+    """
+    states = [state]
+    for _ in range(num_steps):
+        states.append(network.step(network.predict_mean(states[-1]), states[-1]))
+    return states
+
+
 def roll_out(network: SHLSTM, state: HiddenState, horizon: int) -> Prediction:
     """Closed-loop prediction: feeds the predicted means back as inputs for `horizon` steps.
 
@@ -120,11 +140,7 @@ def roll_out(network: SHLSTM, state: HiddenState, horizon: int) -> Prediction:
     Returns:
         `Prediction`: the predictions after each of the T steps, (T, M, ...) each.
     """
-    states = []
-    for _ in range(horizon):
-        state = network.step(network.predict_mean(state), state)
-        states.append(state)
-    return network.predict(HiddenState(*(torch.stack(values) for values in zip(*states, strict=True))))
+    return network.predict(HiddenState.stack(imagine_states(network, state, horizon)[1:]))
 
 
 def select(baseline: Tensor, final: Tensor) -> Tensor:

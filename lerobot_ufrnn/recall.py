@@ -26,7 +26,7 @@ from torch import Generator, Tensor
 
 from .alternatives import REFUTED, Alternatives
 from .attempt import Attempt, Outcome, progress
-from .foresight import Foresight, ForesightTrace, roll_out
+from .foresight import Foresight, ForesightTrace, imagine_states, roll_out
 from .networks import HiddenState, Prediction
 from .recurrent import UFRNN, Memory
 
@@ -194,7 +194,7 @@ class Recall:
         after, trace = self.model.advance(inputs, memory, generator)
         replacements = {}
         for row, episode in enumerate(self._episodes):
-            state = HiddenState(*(values[row : row + 1] for values in after.state))
+            state = after.state.rows(slice(row, row + 1))
             other = self._follow(episode, joints[row], float(surprises[row]), bool(moves[row]), state, generator)
             if other is not None:
                 replacements[row] = other
@@ -249,8 +249,7 @@ class Recall:
             trail.pop()
         episode.anchor = trail[-1]
         states = [moment.state for moment in list(trail)[-1 - self.rewind :]]
-        for _ in range(AHEAD):
-            states.append(network.step(network.predict_mean(states[-1]), states[-1]))
+        states += imagine_states(network, states[-1], AHEAD)[1:]
         episode.moments = HiddenState(*(torch.cat(values) for values in zip(*states, strict=True)))
 
     def _go_back(self, episode: _Episode, generator: Generator | None) -> HiddenState:
@@ -268,7 +267,7 @@ class Recall:
             episode.refuted.clear()
             refuted.zero_()
         chosen = found.choose(refuted, here)
-        begun = HiddenState(*(values[chosen : chosen + 1] for values in found.begun))
+        begun = found.begun.rows(slice(chosen, chosen + 1))
         episode.attempt = Attempt(network, begun, self.commitment, found.ends[chosen])
         episode.surprise = 0.0
         kept = found.futures if self.keep_futures else None

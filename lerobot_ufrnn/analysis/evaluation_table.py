@@ -2,11 +2,11 @@
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
-from io import StringIO
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from .results import DoorResult, format_rate
+from .results import to_csv as fields_to_csv
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,7 @@ def read_table[Row: EvaluationRow](path: Path, row_type: type[Row]) -> list[Row]
 
 def to_csv(rows: Sequence[EvaluationRow]) -> str:
     """The table as CSV, sorted: one row or more, all of the same table."""
-    text = StringIO()
-    writer = csv.DictWriter(text, columns_of(type(rows[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in sorted(rows, key=lambda row: row.key))
-    return text.getvalue()
+    return fields_to_csv(sorted(rows, key=lambda row: row.key))
 
 
 def total(rows: Iterable[EvaluationRow], name: str) -> int:

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 
 from ..networks import HiddenState
 from .colors import DOOR_COLORS
-from .hidden_states import Plane, stack_states
+from .hidden_states import Plane
 from .trial import Attempt, TrialHistory
 
 OTHER_COLOR = "#999999"
@@ -74,7 +74,7 @@ class HiddenPaths:
             label,
             kinds,
             [plane.project(of_episode.h_shared).cpu().numpy() for of_episode in states],
-            plane.project(stack_states(history.states).h_shared[:, 0]).cpu().numpy(),
+            plane.project(HiddenState.stack(history.states).h_shared[:, 0]).cpu().numpy(),
             (first, second),
             history.door_kind,
             history.attempts,

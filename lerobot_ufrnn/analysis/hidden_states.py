@@ -62,16 +62,11 @@ def states_along(policy: UFRNNPolicy, demonstrations: list[Episode]) -> list[Hid
     for step_inputs in inputs.unbind(dim=1):
         memory, _ = policy.model.advance(step_inputs, memory)
         states.append(memory.state)
-    over_time = stack_states(states)  # (L, B, hidden size) each
+    over_time = HiddenState.stack(states)  # (L, B, hidden size) each
     return [
         HiddenState(*(values[: len(episode), row] for values in over_time))
         for row, episode in enumerate(demonstrations)
     ]
-
-
-def stack_states(states: list[HiddenState]) -> HiddenState:
-    """Hidden states over time: L of (B, hidden size) each -> (L, B, hidden size) each."""
-    return HiddenState(*map(torch.stack, zip(*states, strict=True)))
 
 
 @dataclass(frozen=True)

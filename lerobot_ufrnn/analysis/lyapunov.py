@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.func import jvp, vjp
 
+from ..foresight import imagine_states
 from ..networks import SHLSTM, HiddenState
 
 Map = Callable[[Tensor], Tensor]
@@ -23,7 +24,7 @@ Map = Callable[[Tensor], Tensor]
 
 
 def closed_loop(network: SHLSTM) -> Map:
-    """The map that foresight iterates: `network.step(network.predict_mean(state), state)`.
+    """The map that foresight iterates: a step of `imagine_states`.
 
     Args:
         network (`SHLSTM`):
@@ -35,7 +36,7 @@ def closed_loop(network: SHLSTM) -> Map:
 
     def step(flat: Tensor) -> Tensor:
         state = HiddenState(*flat.split(network.state_sizes, dim=-1))
-        return torch.cat(network.step(network.predict_mean(state), state), dim=-1)
+        return flatten(imagine_states(network, state, 1)[1])
 
     return step
 

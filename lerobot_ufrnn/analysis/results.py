@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from io import StringIO
+from typing import Any
 
 from scipy.stats import binomtest
 
@@ -163,10 +164,10 @@ def to_markdown(rows: Sequence[DoorResult]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def to_csv(rows: Sequence[DoorResult]) -> str:
-    """The table for programs: one row a door, counts only."""
+def to_csv(rows: Sequence[Any]) -> str:
+    """The table for programs: the fields of dataclasses of one type, a row each; one or more."""
     text = StringIO()
-    writer = csv.DictWriter(text, [column.name for column in fields(DoorResult)], lineterminator="\n")
+    writer = csv.DictWriter(text, [column.name for column in fields(rows[0])], lineterminator="\n")
     writer.writeheader()
     writer.writerows(asdict(row) for row in rows)
     return text.getvalue()

@@ -4,6 +4,7 @@ Two lower LSTMs, one for the joints and one for the image features, carry the fa
 upper LSTM reads both and speaks back to both. Each lower LSTM predicts mean and variance of its modality's next value.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -21,6 +22,15 @@ class HiddenState(NamedTuple):
     c_image: Tensor
     h_shared: Tensor
     c_shared: Tensor
+
+    @classmethod
+    def stack(cls, states: Sequence["HiddenState"]) -> "HiddenState":
+        """T states of (..., hidden size) each -> (T, ..., hidden size) each."""
+        return cls(*map(torch.stack, zip(*states, strict=True)))
+
+    def rows(self, index: Tensor | slice) -> "HiddenState":
+        """Some rows of each field: (B, hidden size) -> (number of rows, hidden size)."""
+        return HiddenState(*(values[index] for values in self))
 
 
 class Prediction(NamedTuple):
