@@ -1,5 +1,7 @@
 """Training-time augmentation of images (for the autoencoder) and of whole episodes (for the recurrent network)."""
 
+import math
+
 import torch
 from torch import Generator, Tensor
 
@@ -39,6 +41,33 @@ def augment_images(
     # One image of noise serves the whole batch: drawing normal numbers would take longer than all the rest.
     noise = noise_std * torch.randn(images.shape[1:], generator=generator, device=images.device)
     return torch.addcmul(noise, images, gain).clamp_(0, 1)
+
+
+def drifting_noise(like: Tensor, std: float, correlation: float, generator: Generator | None = None) -> Tensor:
+    """Noise that drifts over an episode: a stationary first-order autoregressive process in each dimension.
+
+    A network that reads its inputs with it, and must still predict what was demonstrated, learns to lead back to the
+    demonstrated way from beside it. Independent noise does not teach that: it averages out over a few steps.
+
+    Args:
+        like (`Tensor`):
+            What it is added to, (B, L, D).
+        std (`float`):
+            Standard deviation at every step.
+        correlation (`float`):
+            Correlation of one step with the next, from 0 (white noise) to below 1; it falls to 1/e over
+            `-1 / log(correlation)` steps.
+        generator (`torch.Generator`, *optional*):
+            Source of randomness.
+
+    Returns:
+        `Tensor`: noise, (B, L, D).
+    """
+    white = std * torch.randn(like.shape, generator=generator, dtype=like.dtype, device=like.device)
+    steps = [white[:, 0]]
+    for fresh in white[:, 1:].unbind(1):
+        steps.append(correlation * steps[-1] + math.sqrt(1 - correlation**2) * fresh)
+    return torch.stack(steps, dim=1)
 
 
 def stall_indices(

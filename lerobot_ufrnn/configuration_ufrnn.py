@@ -120,8 +120,11 @@ class UFRNNConfig(PreTrainedConfig):
         kernel (`str`, *optional*, defaults to `"auto"`):
             What computes recurrence and foresight: `reference` is the readable PyTorch code, `fast` the same compiled
             for the CPU (on whatever device the weights are), `auto` is `fast` where Numba can be imported.
-        input_noise (`float`, *optional*, defaults to `0.02`):
+        input_noise (`float`, *optional*, defaults to `0.05`):
             Standard deviation of noise on the recurrent network's inputs during training, in scaled units.
+        input_noise_correlation (`float`, *optional*, defaults to `0.95`):
+            Correlation of that noise from step to step. Noise that drifts teaches the network to lead back to the
+            demonstrated way from beside it, so that what it imagines in closed loop stays true.
         stall_probability (`float`, *optional*, defaults to `0.0`):
             Probability per step that the observation stalls and its target waits (training only). Stalls tie progress
             to what is seen; they also make episodes longer and learning slower.
@@ -181,7 +184,8 @@ class UFRNNConfig(PreTrainedConfig):
     image_noise: float = 0.02
 
     kernel: str = "auto"
-    input_noise: float = 0.02
+    input_noise: float = 0.05
+    input_noise_correlation: float = 0.95
     stall_probability: float = 0.0
     stall_steps: int = 12
     stall_stretch: float = 1.3
@@ -211,12 +215,13 @@ class UFRNNConfig(PreTrainedConfig):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         for name in ("image_shift", "drop_n_last_frames", "recall_rewind", "recall_commitment"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
-        for name in ("image_jitter", "image_noise", "input_noise"):
+        for name in ("image_jitter", "image_noise", "input_noise", "input_noise_correlation"):
             self._require(name, 0 <= getattr(self, name) < 1, "from 0 to below 1")
         for name in ("optimizer_lr", "autoencoder_lr", "optimizer_grad_clip_norm"):
             self._require(name, 0 < getattr(self, name) < math.inf, "above 0")
         self._require("surprise_threshold", 1 < self.surprise_threshold < math.inf, "above 1")
         self._require("recall_memory", 0 <= self.recall_memory < math.inf, "at least 0")
+        self._require("recall_commitment", self.recall_commitment <= self.recall_horizon, "at most `recall_horizon`")
         low, high = self._pair("recall_noise")
         self._require("recall_noise", 0 <= low <= high < math.inf, "two numbers with 0 <= low <= high")
         self._require("stall_probability", 0 <= self.stall_probability <= 1, "from 0 to 1")

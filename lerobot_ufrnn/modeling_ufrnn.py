@@ -9,7 +9,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 from torch import Generator, Tensor, nn
 
-from .augmentation import augment_images, stall_indices
+from .augmentation import augment_images, drifting_noise, stall_indices
 from .checkpoint import find_weights, read_weights
 from .configuration_ufrnn import UFRNNConfig
 from .episodes import Episode, EpisodeStore
@@ -276,8 +276,8 @@ class UFRNNPolicy(PreTrainedPolicy):
     def _recurrent_loss(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, dict[str, float]]:
         inputs, targets, commands, mask = self._sequences(episodes, generator)
         if self.training:
-            noise = torch.randn(inputs.shape, generator=generator, device=inputs.device)
-            inputs = inputs + self.config.input_noise * noise
+            config = self.config
+            inputs = inputs + drifting_noise(inputs, config.input_noise, config.input_noise_correlation, generator)
         prediction, trace = self.model(inputs, generator)
         nll = gaussian_nll(targets, prediction.mean, prediction.log_variance).sum(-1)  # (B, L)
         loss = nll[mask].mean()

@@ -1,8 +1,9 @@
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_ufrnn.augmentation import augment_images, stall_indices
+from lerobot_ufrnn.augmentation import augment_images, drifting_noise, stall_indices
 
 
 def test_a_shift_moves_the_image_and_repeats_its_border():
@@ -26,6 +27,19 @@ def test_augmented_images_stay_images():
     assert augmented.shape == images.shape
     assert augmented.min() >= 0
     assert augmented.max() <= 1
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8, 0.95])
+def test_noise_drifts_as_an_autoregressive_process(correlation):
+    like = torch.zeros(400, 30, 50, dtype=torch.float64)
+    noise = drifting_noise(like, 0.3, correlation, torch.Generator().manual_seed(0))
+    first, second, last = noise[:, 0], noise[:, 1], noise[:, -1]
+    for step in (first, second, last):
+        torch.testing.assert_close(step.std(), torch.tensor(0.3).double(), rtol=0.03, atol=0)
+    for lag in (1, 5):
+        expected = torch.tensor(correlation**lag).double()
+        torch.testing.assert_close((noise[:, lag:] * noise[:, :-lag]).mean() / 0.09, expected, rtol=0, atol=0.02)
+    assert abs((noise[..., 0] * noise[..., 1]).mean() / 0.09) < 0.05  # dimensions are independent
 
 
 @settings(deadline=None)

@@ -59,6 +59,7 @@ def test_a_saved_configuration_loads_equal(tmp_path):
         ("stall_steps", 0, "at least 1"),
         ("image_shift", -1, "at least 0"),
         ("input_noise", -0.1, "from 0"),
+        ("input_noise_correlation", 1.0, "below 1"),
         ("image_noise", 1.5, "below 1"),
         ("recall_samples", 0, "at least 1"),
         ("recall_horizon", 0, "at least 1"),
