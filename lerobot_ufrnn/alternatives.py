@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from .foresight import imagine_states, perturb, roll_out, sample_noise
-from .networks import SHLSTM, HiddenState, Prediction
+from .foresight import perturb, sample_noise
+from .networks import HiddenState, Prediction
+from .recurrent import UFRNN
 
 SETTLE = 6
 """Imagined steps in which a perturbation settles, before a future counts."""
@@ -28,21 +29,34 @@ class Alternatives:
     """Futures that were imagined at one time.
 
     Attributes:
-        begun (`HiddenState`): first states of the futures, (N, hidden size) each.
-        futures (`Prediction`): what they predict for the steps after, up to the horizon, (T, N, ...) each.
-        starts (`Tensor`): scaled joints where they start, (N, D_j).
-        ends (`Tensor`): scaled joints where they end, (N, D_j).
+        states (`HiddenState`): first state of each future and those after, (T + 1, N, hidden size) each.
+        predictions (`Prediction`): what each of these states predicts, (T + 1, N, ...) each.
+        joint_dim (`int`): how many of the predicted values are joints, D_j.
     """
 
-    begun: HiddenState
-    futures: Prediction
-    starts: Tensor
-    ends: Tensor
+    states: HiddenState
+    predictions: Prediction
+    joint_dim: int
+
+    @property
+    def joints(self) -> Tensor:
+        """`Tensor`: scaled joints that are predicted, (T + 1, N, D_j)."""
+        return self.predictions.mean[..., : self.joint_dim]
+
+    @property
+    def starts(self) -> Tensor:
+        """`Tensor`: scaled joints where the futures start, (N, D_j)."""
+        return self.joints[0]
+
+    @property
+    def ends(self) -> Tensor:
+        """`Tensor`: scaled joints where the futures end, (N, D_j)."""
+        return self.joints[-1]
 
     @classmethod
     def imagine(
         cls,
-        network: SHLSTM,
+        model: UFRNN,
         moments: HiddenState,
         num_samples: int,
         noise_range: tuple[float, float],
@@ -56,8 +70,8 @@ class Alternatives:
         moment: early it is forgotten again, late the way is already taken.
 
         Args:
-            network (`SHLSTM`):
-                The network that imagines.
+            model (`UFRNN`):
+                The model that imagines.
             moments (`HiddenState`):
                 States to perturb, (M, hidden size) each.
             num_samples (`int`):
@@ -77,14 +91,13 @@ class Alternatives:
         like, (low, high) = moments.h_joint, noise_range
         first = torch.randint(len(like), (1,), generator=generator, device=like.device)
         rows = (torch.arange(num_samples, device=like.device) + first) % len(like)
-        copies = moments.rows(rows)
+        copies = moments.at(rows)
         std = low + (high - low) * torch.rand(num_samples, 1, generator=generator, dtype=like.dtype, device=like.device)
         noise = std * sample_noise(copies, 1, perturbed, generator=generator)
-        begun = perturb(copies, noise, like.new_ones(num_samples, 2), perturbed)
-        begun = imagine_states(network, begun, SETTLE)[-1]
-        futures = roll_out(network, begun, horizon)
-        starts = network.predict_mean(begun)[:, : network.joint_dim]
-        return cls(begun, futures, starts, futures.mean[-1, :, : network.joint_dim])
+        copies = perturb(copies, noise, like.new_ones(num_samples, 2), perturbed)
+        imagined = model.imagine(copies, SETTLE + horizon)
+        states = imagined.at(slice(SETTLE, None))
+        return cls(states, model.network.predict(states), model.network.joint_dim)
 
     def refuted(self, failures: Iterable[tuple[float, Tensor]], here: Tensor) -> Tensor:
         """How much each future is like a failed one.
@@ -118,8 +131,7 @@ class Alternatives:
         Returns:
             `int`: index of the future.
         """
-        joint_dim = self.ends.shape[-1]
-        soon = self.futures.mean[min(SETTLE, len(self.futures.mean)) - 1, :, :joint_dim]
+        soon = self.joints[min(SETTLE, len(self.joints) - 1)]
         left = (soon - self.ends).norm(dim=-1) / (self.starts - self.ends).norm(dim=-1).clamp(min=1e-6)
         leap = (self.starts - here).norm(dim=-1) / (self.ends - here).norm(dim=-1).clamp(min=1e-6)
         accidental = self._likeness(self.ends, here).sum(-1) < min(FEWEST_ALIKE, len(self.ends))

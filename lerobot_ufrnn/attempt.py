@@ -2,11 +2,9 @@
 
 from enum import Enum
 
-import torch
 from torch import Tensor
 
-from .foresight import imagine_states
-from .networks import SHLSTM, HiddenState
+from .networks import HiddenState
 
 LEAD = 8
 """Imagined steps that an attempt may be ahead of the arm, so that its commands press on against a load."""
@@ -55,19 +53,17 @@ class Attempt:
     listen to its senses again.
 
     Args:
-        network (`SHLSTM`):
-            The network that imagined.
-        begun (`HiddenState`):
-            The first state, (1, hidden size) each.
-        steps (`int`):
-            How many states to carry out after the first.
+        states (`HiddenState`):
+            The states to carry out, (K, hidden size) each.
+        joints (`Tensor`):
+            Scaled joints that each of them predicts, (K, D_j).
         end (`Tensor`):
             Scaled joints where the future ends, (D_j,).
     """
 
-    def __init__(self, network: SHLSTM, begun: HiddenState, steps: int, end: Tensor):
-        self._states = imagine_states(network, begun, steps)
-        self._joints = torch.cat([network.predict_mean(state)[:, : network.joint_dim] for state in self._states])
+    def __init__(self, states: HiddenState, joints: Tensor, end: Tensor):
+        self._states = states
+        self._joints = joints
         self._begun_at: Tensor | None = None
         self._at = -1  # the state that is carried out
         self._reached = 0  # the one whose joints the arm is nearest to
@@ -82,7 +78,7 @@ class Attempt:
     @property
     def state(self) -> HiddenState:
         """`HiddenState`: the state to carry out now, (1, hidden size) each."""
-        return self._states[self._at]
+        return self._states.at(slice(self._at, self._at + 1))
 
     def advance(self, joints: Tensor, as_predicted: bool) -> Outcome:
         """Goes on by a step, or waits.
@@ -96,7 +92,7 @@ class Attempt:
         Returns:
             `Outcome`: `UNDER_WAY` if `state` is to be carried out now.
         """
-        last = len(self._states) - 1
+        last = len(self._joints) - 1
         if self._begun_at is None:
             self._begun_at, self._at = joints, 0
             return Outcome.UNDER_WAY

@@ -26,7 +26,7 @@ from torch import Generator, Tensor
 
 from .alternatives import REFUTED, Alternatives
 from .attempt import Attempt, Outcome, progress
-from .foresight import Foresight, ForesightTrace, imagine_states, roll_out
+from .foresight import Foresight, ForesightTrace
 from .networks import HiddenState, Prediction
 from .recurrent import UFRNN, Memory
 
@@ -194,7 +194,7 @@ class Recall:
         after, trace = self.model.advance(inputs, memory, generator)
         replacements = {}
         for row, episode in enumerate(self._episodes):
-            state = after.state.rows(slice(row, row + 1))
+            state = after.state.at(slice(row, row + 1))
             other = self._follow(episode, joints[row], float(surprises[row]), bool(moves[row]), state, generator)
             if other is not None:
                 replacements[row] = other
@@ -242,15 +242,19 @@ class Recall:
 
     def _remember(self, episode: _Episode, state: HiddenState) -> None:
         """Takes what was being done as refuted, and the moments around the last calm one as those to go on from."""
-        network, trail = self.model.network, episode.trail
-        future = roll_out(network, state, self.horizon)
-        episode.refuted.append((episode.step, future.mean[-1, 0, : network.joint_dim]))
+        trail = episode.trail
+        episode.refuted.append((episode.step, self._foresee(state)))
         while len(trail) > 1 and trail[-1].surprise > CALM * self.threshold:
             trail.pop()
         episode.anchor = trail[-1]
-        states = [moment.state for moment in list(trail)[-1 - self.rewind :]]
-        states += imagine_states(network, states[-1], AHEAD)[1:]
+        remembered = [moment.state for moment in list(trail)[-1 - self.rewind : -1]]
+        states = [*remembered, self.model.imagine(episode.anchor.state, AHEAD).at((slice(None), 0))]
         episode.moments = HiddenState(*(torch.cat(values) for values in zip(*states, strict=True)))
+
+    def _foresee(self, state: HiddenState) -> Tensor:
+        """Scaled joints where this state is leading, (D_j,)."""
+        network, last = self.model.network, self.model.imagine(state, self.horizon).at(-1)
+        return network.predict_mean(last)[0, : network.joint_dim]
 
     def _go_back(self, episode: _Episode, generator: Generator | None) -> HiddenState:
         """Decides on another future and returns to the moment before the surprise."""
@@ -258,7 +262,7 @@ class Recall:
         assert anchor is not None
         assert episode.moments is not None
         found = Alternatives.imagine(
-            network, episode.moments, self.num_samples, self.noise_range, self.perturbed, self.horizon, generator
+            self.model, episode.moments, self.num_samples, self.noise_range, self.perturbed, self.horizon, generator
         )
         here = network.predict_mean(anchor.state)[0, : network.joint_dim]
         refuted = found.refuted(self._failures(episode), here)
@@ -267,10 +271,10 @@ class Recall:
             episode.refuted.clear()
             refuted.zero_()
         chosen = found.choose(refuted, here)
-        begun = found.begun.rows(slice(chosen, chosen + 1))
-        episode.attempt = Attempt(network, begun, self.commitment, found.ends[chosen])
+        begin = slice(self.commitment + 1), chosen
+        episode.attempt = Attempt(found.states.at(begin), found.joints[begin], found.ends[chosen])
         episode.surprise = 0.0
-        kept = found.futures if self.keep_futures else None
+        kept = Prediction(*(values[1:] for values in found.predictions)) if self.keep_futures else None
         episode.events.append(RecallEvent(episode.step, episode.step - anchor.step, refuted, chosen, kept))
         return anchor.state
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Generator, Tensor, nn
 
-from .foresight import Foresight, ForesightTrace, modality_means
+from .foresight import Foresight, ForesightTrace, imagine_states, modality_means
 from .networks import SHLSTM, HiddenState, Prediction
 
 
@@ -78,6 +78,21 @@ class UFRNN(nn.Module):
                 traces.append(trace)
         prediction = Prediction(*(torch.stack(values, dim=1) for values in zip(*predictions, strict=True)))
         return prediction, ForesightTrace.stack(traces) if traces else None
+
+    @torch.no_grad()
+    def imagine(self, state: HiddenState, num_steps: int) -> HiddenState:
+        """States in closed loop, without exploring: the predicted means are fed back as inputs.
+
+        Args:
+            state (`HiddenState`):
+                Where to start from, (M, hidden size) each.
+            num_steps (`int`):
+                Number of steps T.
+
+        Returns:
+            `HiddenState`: `state` and the state after each of the T steps, (T + 1, M, hidden size) each.
+        """
+        return HiddenState.stack(imagine_states(self.network, state, num_steps))
 
     def modality_variance(self, prediction: Prediction) -> Tensor:
         """Mean predicted variance of each modality, (..., 2), joints first."""

@@ -16,7 +16,7 @@ from ..recurrent import UFRNN, Memory
 from .layout import GateGradients, Options, Sizes, Steps, TransposedWeights, Weights
 from .matmul import PANEL
 from .packing import Cells, Heads, pack_cells, pack_heads, to_panels
-from .walk import walk
+from .walk import imagine, walk
 from .walk_back import walk_back
 
 
@@ -67,6 +67,22 @@ class FastUFRNN(UFRNN):
             prediction, _, trace = self._walk(inputs, start, generator, self._pack())
         return Prediction(*(values.transpose(0, 1) for values in prediction)), trace
 
+    @torch.no_grad()
+    def imagine(self, state: HiddenState, num_steps: int) -> HiddenState:
+        """See [`UFRNN.imagine`]."""
+        weights = self._pack_once().weights
+        starts = (_host(values).numpy() for values in _to_rows(state))
+        hidden, cell = (np.repeat(start[None], num_steps + 1, axis=0) for start in starts)
+        _share(lambda first, last: imagine(weights, self._sizes, hidden, cell, first, last), hidden.shape[1])
+        device = state.h_joint.device
+        return self._to_state(torch.from_numpy(hidden).to(device), torch.from_numpy(cell).to(device))
+
+    def _to_state(self, hidden: Tensor, cell: Tensor) -> HiddenState:
+        """Inverse of `_to_rows`."""
+        h_joint, h_image, h_shared = hidden.split(self._sizes[2:], dim=-1)
+        c_joint, c_image, c_shared = cell.split(self._sizes[2:], dim=-1)
+        return HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)
+
     def _walk(
         self, inputs: Tensor, start: HiddenState, generator: Generator | None, packed: _Packed
     ) -> tuple[Prediction, HiddenState, ForesightTrace | None]:
@@ -77,8 +93,7 @@ class FastUFRNN(UFRNN):
         noise = torch.empty(length, 1, batch_size, 0)
         if options.perturbs:
             noise = torch.stack([foresight.sample_noise(start, generator) for _ in range(length)])  # (L, N, B, S)
-        hidden = torch.cat((start.h_joint, start.h_image, start.h_shared), dim=-1)
-        cell = torch.cat((start.c_joint, start.c_image, start.c_shared), dim=-1)
+        hidden, cell = _to_rows(start)
         schedule = foresight.schedule
         episodes = _Episodes(
             self._sizes,
@@ -95,10 +110,7 @@ class FastUFRNN(UFRNN):
         else:
             episodes.walk(inputs.numpy())
             kept = torch.from_numpy(steps.hidden)
-        parts = self._sizes[2:]
-        h_joint, h_image, h_shared = kept.to(device).split(parts, dim=-1)
-        c_joint, c_image, c_shared = torch.from_numpy(steps.cell).to(device).split(parts, dim=-1)
-        states = HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)  # (L, B, hidden size) each
+        states = self._to_state(kept.to(device), torch.from_numpy(steps.cell).to(device))  # (L, B, hidden size) each
         prediction = self.network.predict(states)
         last = HiddenState(*(values[-1] for values in states))
         return prediction, last, _trace(steps, options, device) if options.selects else None
@@ -132,6 +144,12 @@ def _trace(steps: Steps, options: Options, device: torch.device) -> ForesightTra
     return ForesightTrace(
         noise_std, chosen, baseline, final, horizon, calmest if options.learned_horizon else None, None
     )
+
+
+def _to_rows(state: HiddenState) -> tuple[Tensor, Tensor]:
+    """Hidden and cell states, (..., H) each."""
+    hidden = torch.cat((state.h_joint, state.h_image, state.h_shared), dim=-1)
+    return hidden, torch.cat((state.c_joint, state.c_image, state.c_shared), dim=-1)
 
 
 def _host(values: Tensor) -> Tensor:

@@ -307,3 +307,34 @@ def walk(
                 )
         steps.hidden[t, first:last] = hidden
         steps.cell[t, first:last] = cell
+
+
+@compiled
+def imagine(
+    weights: Weights, sizes: Sizes, hidden_steps: np.ndarray, cell_steps: np.ndarray, first: int, last: int
+) -> None:
+    """Goes on in closed loop from states `first` to `last - 1` of M, without exploring.
+
+    Args:
+        weights (`Weights`):
+            The network.
+        sizes (`Sizes`):
+            Its sizes.
+        hidden_steps (`np.ndarray`), cell_steps (`np.ndarray`):
+            States, (T + 1, M, H): those to start from are given, the others are filled.
+        first (`int`), last (`int`):
+            Which states.
+    """
+    hidden, cell = hidden_steps[0, first:last].copy(), cell_steps[0, first:last].copy()
+    number, num_rows = hidden.dtype, hidden.shape[0]
+    scratch = np.zeros((num_rows, max(weights.joint_mean_bias.shape[0], weights.image_mean_bias.shape[0])), number)
+    joint_input = np.empty((num_rows, sizes.joint_dim + sizes.shared_hidden), number)
+    image_input = np.empty((num_rows, sizes.feature_dim + sizes.shared_hidden), number)
+    shared_gates = np.empty((num_rows, weights.shared_bias.shape[0]), number)
+    joint_gates = np.empty((num_rows, weights.joint_bias.shape[0]), number)
+    image_gates = np.empty((num_rows, weights.image_bias.shape[0]), number)
+    for t in range(1, hidden_steps.shape[0]):
+        _imagine_inputs(weights, sizes, hidden, joint_input, image_input, scratch)
+        _step(weights, sizes, hidden, cell, joint_input, image_input, shared_gates, joint_gates, image_gates)
+        hidden_steps[t, first:last] = hidden
+        cell_steps[t, first:last] = cell

@@ -5,7 +5,7 @@ upper LSTM reads both and speaks back to both. Each lower LSTM predicts mean and
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,8 +28,8 @@ class HiddenState(NamedTuple):
         """T states of (..., hidden size) each -> (T, ..., hidden size) each."""
         return cls(*map(torch.stack, zip(*states, strict=True)))
 
-    def rows(self, index: Tensor | slice) -> "HiddenState":
-        """Some rows of each field: (B, hidden size) -> (number of rows, hidden size)."""
+    def at(self, index: Any) -> "HiddenState":
+        """Each field at an index, as of a tensor."""
         return HiddenState(*(values[index] for values in self))
 
 

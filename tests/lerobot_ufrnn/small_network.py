@@ -4,7 +4,9 @@ import numpy as np
 import torch
 from oracle import Oracle
 
+from lerobot_ufrnn.foresight import Foresight, NoiseSchedule
 from lerobot_ufrnn.networks import SHLSTM, HiddenState
+from lerobot_ufrnn.recurrent import UFRNN
 
 JOINTS, FEATURES = 3, 4
 
@@ -18,6 +20,12 @@ def small_network(hidden_dim: int = 6) -> SHLSTM:
     network.joint_head.weight.data[JOINTS : 2 * JOINTS] = 0
     network.joint_head.bias.data[JOINTS : 2 * JOINTS] = torch.tensor([-4.0, -4.5, -5.0])
     return network.requires_grad_(False)
+
+
+def small_model(hidden_dim: int = 6) -> UFRNN:
+    """The small network in a model that does not explore."""
+    schedule = NoiseSchedule((0.05, 0.15), "std", False)
+    return UFRNN(small_network(hidden_dim), Foresight("none", schedule, num_samples=1, horizon=1))
 
 
 def random_state(network: SHLSTM, rows: int, seed: int = 0) -> HiddenState:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from oracle import Oracle
-from small_network import FEATURES, JOINTS, in_closed_loop, is_close, random_state, row_of, small_network
+from small_network import FEATURES, JOINTS, in_closed_loop, is_close, random_state, row_of, small_model, small_network
 
 from lerobot_ufrnn import alternatives as alternatives_module
 from lerobot_ufrnn.alternatives import FEWEST_ALIKE, REFUTED, SAME_FUTURE, SETTLE, Alternatives
@@ -20,10 +20,10 @@ def imagine(
     moments: int = 3, num_samples: int = 6, noise=(0.0, 0.0), perturbed="hidden", hidden_dim: int = 6, seed: int = 0
 ) -> tuple[HiddenState, Alternatives]:
     """Random moments, and the alternatives imagined from them."""
-    network = small_network(hidden_dim)
-    states = random_state(network, moments, seed=1)
+    model = small_model(hidden_dim)
+    states = random_state(model.network, moments, seed=1)
     generator = torch.Generator().manual_seed(seed)
-    found = Alternatives.imagine(network, states, num_samples, noise, PERTURBED_STATES[perturbed], HORIZON, generator)
+    found = Alternatives.imagine(model, states, num_samples, noise, PERTURBED_STATES[perturbed], HORIZON, generator)
     return states, found
 
 
@@ -35,15 +35,15 @@ def test_without_noise_the_futures_are_those_of_the_moments_in_turn_in_closed_lo
     network = small_network()
     states, found = imagine(moments=3, num_samples=7, seed=seed)
     futures = [in_closed_loop(network, row_of(states, row), SETTLE + HORIZON) for row in range(3)]
-    assert found.futures.mean.shape == (HORIZON, 7, JOINTS + FEATURES)
-    first = next(row for row in range(3) if is_close(found.begun, futures[row][SETTLE]))
+    assert found.predictions.mean.shape == (1 + HORIZON, 7, JOINTS + FEATURES)
+    first = next(row for row in range(3) if is_close(found.states.at(0), futures[row][SETTLE]))
     oracle = Oracle(network)
     for copy in range(7):
         future = futures[(first + copy) % 3]
-        assert is_close(found.begun, future[SETTLE], row=copy)
         predicted = [oracle.predict(state) for state in future[SETTLE:]]
-        for step, expected in enumerate(predicted[1:]):
-            for ours, theirs in zip(found.futures, expected, strict=True):
+        for step, expected in enumerate(predicted):
+            assert is_close(found.states.at(step), future[SETTLE + step], row=copy)
+            for ours, theirs in zip(found.predictions, expected, strict=True):
                 np.testing.assert_allclose(ours[step, copy], theirs, atol=1e-10)
         np.testing.assert_allclose(found.starts[copy], predicted[0][0][:JOINTS], atol=1e-10)
         np.testing.assert_allclose(found.ends[copy], predicted[-1][0][:JOINTS], atol=1e-10)
@@ -53,7 +53,7 @@ def test_each_moment_gets_as_many_copies_as_the_others():
     for seed in range(5):
         states, found = imagine(moments=4, num_samples=12, seed=seed)
         begun = [in_closed_loop(small_network(), row_of(states, row), SETTLE)[-1] for row in range(4)]
-        copies = [sum(is_close(found.begun, begun[row], copy) for copy in range(12)) for row in range(4)]
+        copies = [sum(is_close(found.states.at(0), begun[row], copy) for copy in range(12)) for row in range(4)]
         assert copies == [3, 3, 3, 3]
 
 
@@ -65,7 +65,7 @@ def test_a_single_copy_may_be_of_any_moment():
 def test_the_noise_of_the_copies_is_anywhere_in_the_range(monkeypatch):
     monkeypatch.setattr(alternatives_module, "SETTLE", 0)
     states, found = imagine(moments=1, num_samples=200, noise=(0.2, 1.4), hidden_dim=500)
-    noise = found.begun.h_joint - states.h_joint
+    noise = found.states.h_joint[0] - states.h_joint
     np.testing.assert_allclose(noise.mean(-1), 0, atol=0.3)  # five standard errors of the most
     np.testing.assert_allclose(noise.std(-1).sort().values, np.linspace(0.2, 1.4, 200), atol=0.15)
     correlation = np.corrcoef(noise.numpy()) - np.eye(200)
@@ -76,7 +76,7 @@ def test_all_perturbed_parts_of_a_copy_get_the_same_noise(monkeypatch):
     monkeypatch.setattr(alternatives_module, "SETTLE", 0)
     states, found = imagine(moments=1, num_samples=4000, noise=(0.7, 0.7), hidden_dim=3)
     for name in PERTURBED_STATES["hidden"]:
-        noise = getattr(found.begun, name) - getattr(states, name)
+        noise = getattr(found.states, name)[0] - getattr(states, name)
         np.testing.assert_allclose(noise.std(0), 0.7, rtol=0.06)  # five standard errors
 
 
@@ -84,7 +84,7 @@ def test_all_perturbed_parts_of_a_copy_get_the_same_noise(monkeypatch):
 def test_only_what_is_to_be_perturbed_is(monkeypatch, perturbed):
     monkeypatch.setattr(alternatives_module, "SETTLE", 0)
     states, found = imagine(moments=1, num_samples=5, noise=(0.5, 0.5), perturbed=perturbed)
-    for name, value, copies in zip(HiddenState._fields, states, found.begun, strict=True):
+    for name, value, copies in zip(HiddenState._fields, states, found.states.at(0), strict=True):
         changed = (copies != value).any(-1)
         assert changed.all() if name in PERTURBED_STATES[perturbed] else not changed.any()
 
@@ -94,17 +94,16 @@ def test_noise_settles_before_the_future_begins():
     network = small_network()
     _, found = imagine(noise=(1.0, 2.0))
     for copy in range(6):
-        after = in_closed_loop(network, row_of(found.begun, copy), 1)[-1]
-        np.testing.assert_allclose(found.futures.mean[0, copy], Oracle(network).predict(after)[0], atol=1e-10)
-        np.testing.assert_allclose(
-            found.starts[copy], Oracle(network).predict(row_of(found.begun, copy))[0][:JOINTS], atol=1e-10
-        )
+        begun = row_of(found.states.at(0), copy)
+        after = in_closed_loop(network, begun, 1)[-1]
+        np.testing.assert_allclose(found.predictions.mean[1, copy], Oracle(network).predict(after)[0], atol=1e-10)
+        np.testing.assert_allclose(found.starts[copy], Oracle(network).predict(begun)[0][:JOINTS], atol=1e-10)
 
 
 def test_a_generator_makes_it_reproducible():
     first, again, other = (imagine(noise=(0.5, 1.0), seed=seed)[1] for seed in (3, 3, 4))
     assert torch.equal(first.ends, again.ends)
-    assert torch.equal(first.begun.h_shared, again.begun.h_shared)
+    assert torch.equal(first.states.h_shared, again.states.h_shared)
     assert not torch.equal(first.ends, other.ends)
 
 
@@ -117,14 +116,15 @@ def made_up(ends, starts=None, soon=None, horizon: int = 2 * SETTLE) -> Alternat
     """Futures of two joints that start at `HERE` and are at their ends from the settling on, unless told otherwise."""
     ends = torch.as_tensor(ends, dtype=torch.float64)
     starts = HERE.expand_as(ends) if starts is None else torch.as_tensor(starts, dtype=torch.float64)
-    mean = torch.full((horizon, len(ends), 3), 7.0, dtype=torch.float64)
+    mean = torch.full((1 + horizon, len(ends), 3), 7.0, dtype=torch.float64)
     mean[..., :2] = 77.0  # what is in between does not count
+    mean[0, :, :2] = starts
     mean[-1, :, :2] = ends
     if horizon > SETTLE:
-        mean[SETTLE - 1, :, :2] = ends if soon is None else torch.as_tensor(soon, dtype=torch.float64)
-    nothing = mean.new_empty(horizon, len(ends), 0)
-    begun = HiddenState(*(ends.new_zeros(len(ends), 1) for _ in HiddenState._fields))
-    return Alternatives(begun, Prediction(mean, mean, nothing, nothing), starts, ends)
+        mean[SETTLE, :, :2] = ends if soon is None else torch.as_tensor(soon, dtype=torch.float64)
+    nothing = mean.new_empty(1 + horizon, len(ends), 0)
+    states = HiddenState(*(ends.new_zeros(1 + horizon, len(ends), 1) for _ in HiddenState._fields))
+    return Alternatives(states, Prediction(mean, mean, nothing, nothing), joint_dim=2)
 
 
 def kernel_width(ends: np.ndarray) -> float:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from small_network import JOINTS, in_closed_loop, is_close, random_state, row_of, small_network
 
 from lerobot_ufrnn.attempt import FIRST_STEPS, LEAD, LEAST_PROGRESS, PATIENCE, Attempt, Outcome, progress
 from lerobot_ufrnn.networks import HiddenState
@@ -13,29 +12,18 @@ UNTIL_BLOCKED = 1 + FIRST_STEPS + PATIENCE + 1
 """Calls for an arm that never moves: the first state, those that ask for too little, the patience, one too many."""
 
 
-class Line:
-    """Imagines that two joints go straight on; a hidden state is how many steps they have gone."""
-
-    joint_dim = 2
-    direction = torch.tensor([[0.03, -0.04]], dtype=torch.float64)
-    origin = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
-
-    def step(self, inputs, state):
-        torch.testing.assert_close(inputs, self.predict_mean(state))
-        return HiddenState(*(values + 1 for values in state))
-
-    def predict_mean(self, state):
-        joints = self.origin + state.h_joint * self.direction
-        return torch.cat((joints, joints.new_full((len(joints), 3), 9.0)), dim=-1)
+DIRECTION = torch.tensor([0.03, -0.04], dtype=torch.float64)
+ORIGIN = torch.tensor([0.3, 0.1], dtype=torch.float64)
 
 
-def on_the_line(place: float) -> torch.Tensor:
-    return (Line.origin + place * Line.direction)[0]
+def on_the_line(place: float | torch.Tensor) -> torch.Tensor:
+    return ORIGIN + place * DIRECTION
 
 
 def attempt_on_the_line(steps: int = STEPS) -> Attempt:
-    begun = HiddenState(*(torch.zeros(1, 1, dtype=torch.float64) for _ in HiddenState._fields))
-    return Attempt(Line(), begun, steps, on_the_line(100))
+    """Two joints that are to go straight on; a hidden state is how many steps they have gone."""
+    gone = torch.arange(steps + 1, dtype=torch.float64)[:, None]
+    return Attempt(HiddenState(*(gone for _ in HiddenState._fields)), on_the_line(gone), on_the_line(100))
 
 
 class Arm:
@@ -108,17 +96,13 @@ def test_it_begins_with_the_first_state_wherever_the_arm_is():
         assert arm.at == 0
 
 
-def test_an_arm_that_follows_gets_one_state_after_the_other_as_the_oracle_imagines_them():
-    network = small_network()
-    begun = random_state(network, 1)
-    expected = in_closed_loop(network, row_of(begun), STEPS)
-    attempt = Attempt(network, begun, STEPS, torch.zeros(JOINTS))
-    joints = torch.zeros(JOINTS, dtype=torch.float64)
+def test_an_arm_that_follows_gets_one_state_after_the_other():
+    arm = Arm()
     for step in range(STEPS + 1):
-        assert attempt.advance(joints, as_predicted=True) is Outcome.UNDER_WAY
-        assert is_close(attempt.state, expected[step])
-        joints = network.predict_mean(attempt.state)[0, :JOINTS]
-    assert attempt.advance(joints, as_predicted=True) is Outcome.DONE
+        assert arm.goes_to(step, as_predicted=True) is Outcome.UNDER_WAY
+        assert arm.at == step
+    assert all(values.shape == (1, 1) for values in arm.attempt.state)
+    assert arm.goes_to(STEPS, as_predicted=True) is Outcome.DONE
 
 
 @pytest.mark.parametrize("lag", range(1, LEAD))

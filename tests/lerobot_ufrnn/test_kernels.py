@@ -17,7 +17,7 @@ from lerobot_ufrnn.kernels.matmul import PANEL, multiply_add
 from lerobot_ufrnn.kernels.packing import to_panels
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
-from lerobot_ufrnn.networks import SHLSTM, gaussian_nll
+from lerobot_ufrnn.networks import SHLSTM, HiddenState, gaussian_nll
 from lerobot_ufrnn.recurrent import UFRNN
 
 sizes = st.integers(1, 20)
@@ -55,6 +55,27 @@ def run(model, inputs, seed):
 
 def named(name):
     return lambda text: f"{name}: {text}"
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    dims=st.tuples(sizes, sizes, sizes, sizes, sizes),
+    rows=st.integers(1, 9),
+    num_steps=st.integers(0, 12),
+    threads=st.integers(1, 3),
+    seed=st.integers(0, 1000),
+)
+def test_what_is_imagined_equals_the_reference(dims, rows, num_steps, threads, seed):
+    reference, fast = make_pair(dims, seed)
+    state = HiddenState(*(torch.randn(rows, size).double() for size in reference.network.state_sizes))
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        found = fast.imagine(state, num_steps)
+    finally:
+        torch.set_num_threads(before)
+    for ours, theirs in zip(found, reference.imagine(state, num_steps), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
 @settings(max_examples=40, deadline=None)

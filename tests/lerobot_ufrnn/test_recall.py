@@ -444,32 +444,25 @@ def script(monkeypatch, doing: tuple[float, ...]) -> None:
     ends = torch.tensor(WAYS, dtype=torch.float64)
     left = torch.tensor([{RIGHT: 0.1, LEFT: 0.2, UP: 0.3}[way] - 0.01 * (row % 4) for row, way in enumerate(WAYS)])
 
-    def futures(count: int) -> Prediction:
-        mean = torch.zeros(HORIZON, count, JOINTS + FEATURES, dtype=torch.float64)
-        nothing = mean.new_empty(HORIZON, count, 0)
-        return Prediction(mean, mean, nothing, nothing)
+    def imagine(model, moments, *settings):
+        states = model.imagine(moments.at([REWIND] * len(WAYS)), HORIZON)
+        mean = model.network.predict_mean(states)  # what is carried out is true; it ends before it settles
+        here = mean[0, :, :JOINTS]
+        mean[SETTLE, :, :JOINTS] = ends + left[:, None] * (here - ends)
+        mean[-1, :, :JOINTS] = ends
+        nothing = mean.new_empty(1 + HORIZON, len(WAYS), 0)
+        return Alternatives(states, Prediction(mean, mean, nothing, nothing), JOINTS)
 
-    def imagine(network, moments, *settings):
-        here = network.predict_mean(HiddenState(*(values[REWIND : REWIND + 1] for values in moments)))[:, :JOINTS]
-        found = futures(len(WAYS))
-        found.mean[SETTLE - 1, :, :JOINTS] = ends + left[:, None] * (here - ends)
-        found.mean[-1, :, :JOINTS] = ends
-        begun = HiddenState(*(values[:1].expand(len(WAYS), -1) for values in moments))
-        return Alternatives(begun, found, here.expand_as(ends), ends)
-
-    def roll_out(network, state, horizon):
-        assert horizon == HORIZON
-        found = futures(1)
-        found.mean[-1, 0, :JOINTS] = torch.tensor(doing)
-        return found
+    def foresee(recall, state):
+        return torch.tensor(doing, dtype=torch.float64)
 
     monkeypatch.setattr(recall_module.Alternatives, "imagine", imagine)
-    monkeypatch.setattr(recall_module, "roll_out", roll_out)
+    monkeypatch.setattr(recall_module.Recall, "_foresee", foresee)
 
 
 def failing_world(failures: int, **overrides) -> World:
     """Every try is blocked."""
-    world = World(make_recall(**overrides))
+    world = World(make_recall(commitment=SETTLE - 1, **overrides))
     world.steps(CALM_STEPS)
     world.surprise()
     for _ in range(failures):
