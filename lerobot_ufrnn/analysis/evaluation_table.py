@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from .results import DoorResult, format_rate
+from .results import DoorResult
 from .results import to_csv as fields_to_csv
 
 
@@ -31,6 +31,38 @@ class EvaluationRow:
     def key(self) -> tuple[str, int, int, str]:
         """`tuple[str, int, int, str]`: what was tried; a table has one row for it."""
         return self.model, self.train_seed, self.epoch, self.kind
+
+
+@dataclass(frozen=True)
+class ProtocolRow(EvaluationRow):
+    """Undisturbed trials of one checkpoint on one kind of door, in counts.
+
+    Attributes:
+        opened_150 (`int`): opened within 150 steps (15 s).
+        opened_300 (`int`): opened within 300 steps (30 s).
+        first_try_wrong (`int`): trials whose first direction was wrong.
+        recovered (`int`): of those, opened within 300 steps.
+    """
+
+    opened_150: int
+    opened_300: int
+    first_try_wrong: int
+    recovered: int
+
+
+@dataclass(frozen=True)
+class InterferenceRow(EvaluationRow):
+    """Trials of one checkpoint on one kind of door that somebody held once it had begun to open, in counts.
+
+    Attributes:
+        held (`int`): trials in which the door began to open and so was held.
+        opened_after_hold (`int`): of those, opened within 300 steps (30 s).
+        tried_another_way (`int`): of those held, trials with another direction tried meanwhile.
+    """
+
+    held: int
+    opened_after_hold: int
+    tried_another_way: int
 
 
 def columns_of(row_type: type[EvaluationRow]) -> list[str]:
@@ -106,11 +138,6 @@ def to_csv(rows: Sequence[EvaluationRow]) -> str:
 def total(rows: Iterable[EvaluationRow], name: str) -> int:
     """Sum of a column of counts."""
     return sum(getattr(row, name) for row in rows)
-
-
-def rate(rows: Sequence[EvaluationRow], successes: str, trials: str = "trials") -> str:
-    """One column of counts as a share of another, both pooled, with its interval; see `format_rate`."""
-    return format_rate(total(rows, successes), total(rows, trials))
 
 
 def last_epochs[Row: EvaluationRow](rows: Iterable[Row]) -> dict[str, list[Row]]:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
-from .evaluation_table import EvaluationRow, last_epochs, read_table, total
-from .results import newcombe_interval, wilson_interval
+from .evaluation_table import EvaluationRow, InterferenceRow, ProtocolRow, last_epochs, read_table, total
+from .results import format_rate, newcombe_interval, wilson_interval
 
 MINUS, DASH = "\N{MINUS SIGN}", "\N{EN DASH}"
 
@@ -72,7 +72,7 @@ INTERFERENCE_COLUMNS = (
 
 @dataclass(frozen=True)
 class Table:
-    """What a page shows as a table.
+    """What a page or a terminal shows as a table.
 
     Attributes:
         caption (`str`): what its numbers are.
@@ -85,6 +85,15 @@ class Table:
     columns: list[str]
     num_names: int
     rows: list[list[str | int | Rate]]
+
+    def to_markdown(self) -> str:
+        """`str`: the table for a terminal, its rates with counts and 95 % Wilson intervals."""
+        lines = [self.columns, ["---"] * len(self.columns)]
+        for row in self.rows:
+            lines.append(
+                [format_rate(cell.successes, cell.trials) if isinstance(cell, Rate) else str(cell) for cell in row]
+            )
+        return "".join([f"{self.caption}:\n\n", *(f"| {' | '.join(line)} |\n" for line in lines)])
 
 
 def read_rows[Row: EvaluationRow](path: Path, row_type: type[Row], columns: Sequence[RateColumn]) -> list[Row]:
@@ -175,6 +184,24 @@ def compare(rows: Sequence[EvaluationRow], columns: Sequence[RateColumn], captio
         points = [_difference(column.of(of_model), column.of(of_other)) for column in columns]
         cells.append([f"{model} {MINUS} {other}", *points])
     return Table(caption, ["difference", *(column.heading for column in columns)], 1, cells)
+
+
+def success_tables(rows: Sequence[ProtocolRow]) -> list[Table]:
+    """What undisturbed trials say: by model, how models differ if there are two or more, and by kind of door."""
+    tables = [
+        summarize(rows, SUCCESS_COLUMNS, "Doors opened, model by model"),
+        compare(rows, SUCCESS_COLUMNS, "Differences in percentage points, with 95 % Newcombe intervals"),
+        summarize(rows, SUCCESS_COLUMNS, "Doors opened, door by door", by_kind=True),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def interference_tables(rows: Sequence[InterferenceRow]) -> list[Table]:
+    """What trials with a held door say: by model, and by kind of door."""
+    return [
+        summarize(rows, INTERFERENCE_COLUMNS, "Trials with a held door, model by model"),
+        summarize(rows, INTERFERENCE_COLUMNS, "Trials with a held door, door by door", by_kind=True),
+    ]
 
 
 def _difference(rate: Rate, other: Rate) -> str:

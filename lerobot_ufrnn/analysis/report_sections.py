@@ -3,9 +3,15 @@
 from pathlib import Path
 
 from . import success_curve
-from .interference_table import InterferenceRow
-from .protocol_table import ProtocolRow
-from .rate_table import INTERFERENCE_COLUMNS, SUCCESS_COLUMNS, compare, read_rows, summarize
+from .evaluation_table import InterferenceRow, ProtocolRow
+from .rate_table import (
+    INTERFERENCE_COLUMNS,
+    SUCCESS_COLUMNS,
+    interference_tables,
+    read_rows,
+    success_tables,
+    summarize,
+)
 from .report_page import Note, Section, draw_picture, read_picture
 
 SUCCESS_TABLE = "door_protocol.csv"
@@ -40,14 +46,7 @@ def success(results_dir: Path) -> Section:
     if not path.exists():
         section.notes.append(_missing(path, "ufrnn protocol --models=[configs/ufrnn.yaml]"))
         return section
-    rows = read_rows(path, ProtocolRow, SUCCESS_COLUMNS)
-    section.tables = [
-        summarize(rows, SUCCESS_COLUMNS, "Doors opened, model by model"),
-        summarize(rows, SUCCESS_COLUMNS, "Doors opened, door by door", by_kind=True),
-    ]
-    if len({row.model for row in rows}) > 1:
-        caption = "Differences in percentage points, with 95 % Newcombe intervals"
-        section.tables.insert(1, compare(rows, SUCCESS_COLUMNS, caption))
+    section.tables = success_tables(read_rows(path, ProtocolRow, SUCCESS_COLUMNS))
     return section
 
 
@@ -83,11 +82,7 @@ def interference(results_dir: Path) -> Section:
     )
     path = results_dir / INTERFERENCE_TABLE
     if path.exists():
-        rows = read_rows(path, InterferenceRow, INTERFERENCE_COLUMNS)
-        section.tables = [
-            summarize(rows, INTERFERENCE_COLUMNS, "Trials with a held door, model by model"),
-            summarize(rows, INTERFERENCE_COLUMNS, "Trials with a held door, door by door", by_kind=True),
-        ]
+        section.tables = interference_tables(read_rows(path, InterferenceRow, INTERFERENCE_COLUMNS))
     else:
         section.notes.append(_missing(path, "ufrnn protocol --models=[configs/ufrnn.yaml] --hold_seconds=5"))
     _add_picture(

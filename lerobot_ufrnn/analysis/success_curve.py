@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from .colors import DOOR_COLORS
-from .evaluation_table import total
-from .protocol_table import ProtocolRow
+from .evaluation_table import ProtocolRow, total
 
 PANELS_PER_ROW = 3
 

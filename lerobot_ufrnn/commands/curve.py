@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..analysis.evaluation_table import read_table
-from ..analysis.protocol_table import ProtocolRow
+from ..analysis.evaluation_table import ProtocolRow, read_table
 from ..analysis.success_curve import draw
 from .flags import parse_flags
 

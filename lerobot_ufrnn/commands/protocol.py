@@ -3,10 +3,8 @@
 import logging
 import signal
 
-from ..analysis import interference_table, protocol_table
-from ..analysis.evaluation_table import read_table
-from ..analysis.interference_table import InterferenceRow
-from ..analysis.protocol_table import ProtocolRow
+from ..analysis.evaluation_table import InterferenceRow, ProtocolRow, read_table
+from ..analysis.rate_table import interference_tables, success_tables
 from ..experiments.chain import plan
 from ..experiments.configuration import ProtocolConfig
 from ..experiments.demonstrations import record_missing
@@ -51,5 +49,7 @@ def run(arguments: list[str]) -> None:
 
 def _summary(config: ProtocolConfig) -> str:
     if config.hold_seconds > 0:
-        return interference_table.to_markdown(read_table(config.table, InterferenceRow))
-    return protocol_table.to_markdown(read_table(config.table, ProtocolRow))
+        tables = interference_tables(read_table(config.table, InterferenceRow))
+    else:
+        tables = success_tables(read_table(config.table, ProtocolRow))
+    return "\n".join(table.to_markdown() for table in tables)

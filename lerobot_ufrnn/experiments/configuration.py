@@ -8,9 +8,7 @@ from typing import Any
 from env_door.env import MAX_HOLD, MAX_OFFSET
 from env_door.latch import KINDS
 
-from ..analysis.evaluation_table import EvaluationRow
-from ..analysis.interference_table import InterferenceRow
-from ..analysis.protocol_table import ProtocolRow
+from ..analysis.evaluation_table import EvaluationRow, InterferenceRow, ProtocolRow
 
 EXECUTORS = ("local", "slurm")
 NAME_CHARACTERS = set(string.ascii_letters + string.digits + "_-")

@@ -14,10 +14,8 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from small import observation, small_config
 
-from lerobot_ufrnn.analysis.evaluation_table import to_csv
+from lerobot_ufrnn.analysis.evaluation_table import InterferenceRow, ProtocolRow, to_csv
 from lerobot_ufrnn.analysis.foresight_picture import draw_strip
-from lerobot_ufrnn.analysis.interference_table import InterferenceRow
-from lerobot_ufrnn.analysis.protocol_table import ProtocolRow
 from lerobot_ufrnn.analysis.trial import Attempt, Imagination, TrialHistory, run_trial
 from lerobot_ufrnn.analysis.trial_video import BAR_HEIGHT, annotate, encode
 from lerobot_ufrnn.commands import main

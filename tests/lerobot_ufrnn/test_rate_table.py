@@ -2,10 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from lerobot_ufrnn.analysis import interference_table
-from lerobot_ufrnn.analysis.evaluation_table import read_table, rows_of, to_csv
-from lerobot_ufrnn.analysis.interference_table import InterferenceRow
-from lerobot_ufrnn.analysis.protocol_table import ProtocolRow, to_markdown
+from lerobot_ufrnn.analysis.evaluation_table import InterferenceRow, ProtocolRow, read_table, rows_of, to_csv
+from lerobot_ufrnn.analysis.rate_table import MINUS, interference_tables, success_tables
 from lerobot_ufrnn.analysis.results import DoorResult
 from lerobot_ufrnn.analysis.success_curve import draw
 from lerobot_ufrnn.commands import main
@@ -78,22 +76,27 @@ def test_rows_of_interference_are_not_mixed_with_others(tmp_path):
 
 def test_the_summary_of_interference_counts_held_doors_only():
     rows = [HELD_ROW, replace(HELD_ROW, train_seed=1, kind="push", held=0, opened_after_hold=0, tried_another_way=0)]
-    text = interference_table.to_markdown([*rows, replace(HELD_ROW, epoch=20)])
+    models, doors = (table.to_markdown() for table in interference_tables([*rows, replace(HELD_ROW, epoch=20)]))
     held, opened, tried = "8/20 = 40% [22%, 61%]", "6/8 = 75% [41%, 93%]", "4/8 = 50% [22%, 78%]"
-    assert text.splitlines()[2:] == [f"| ufrnn | 100 | 2 | {held} | {opened} | {tried} |"]
+    assert models.splitlines()[4:] == [f"| ufrnn | {held} | {opened} | {tried} | 100 | 2 |"]
+    assert doors.splitlines()[4:] == [
+        f"| ufrnn | pull | 8/10 = 80% [49%, 94%] | {opened} | {tried} | 100 | 1 |",
+        "| ufrnn | push | 0/10 = 0% [0%, 28%] | - | - | 100 | 1 |",
+    ]
 
 
 def test_the_summary_pools_seeds_at_the_last_epoch_and_compares_models():
-    text = to_markdown([*results("ufrnn"), *results("act", epochs=(7,), opened=(1, 0, 2))])
-    assert "| ufrnn | 200 | 2 | 12/60 = 20% [12%, 32%] | 30/60 = 50% [38%, 62%] | slide 2/20 = 10% [3%, 30%] |" in text
-    assert "| 12/24 = 50% [31%, 69%] |\n" in text
-    assert "| act | 7 | 2 | 2/60" in text
-    assert "pull 0/20" in text
-    assert "| act - ufrnn | -40 [-53, -24] |\n" in text
+    rows = [*results("ufrnn"), *results("act", epochs=(7,), opened=(1, 0, 2))]
+    models, differences, doors = (table.to_markdown() for table in success_tables(rows))
+    assert "| ufrnn | 30/60 = 50% [38%, 62%] | 12/24 = 50% [31%, 69%] |" in models
+    assert models.splitlines()[-1].endswith("| 12/60 = 20% [12%, 32%] | 200 | 2 |")
+    assert "| act | 6/60 = 10%" in models
+    assert f"| ufrnn {MINUS} act | +40 [+24, +53] |" in differences
+    assert "| ufrnn | slide | 2/20 = 10% [3%, 30%] |" in doors
 
 
 def test_one_model_differs_from_none():
-    assert "difference" not in to_markdown(results("ufrnn"))
+    assert [table.columns[0] for table in success_tables(results("ufrnn"))] == ["model", "model"]
 
 
 @pytest.mark.parametrize("epochs", [(100,), (100, 200, 500)])
