@@ -12,6 +12,7 @@ import yaml
 from env_door.latch import KINDS
 from env_door.provenance import PROVENANCE_PATH
 from env_door.trials import Trial
+from lerobot_ufrnn.analysis.rate_table import MINUS
 from lerobot_ufrnn.commands import main
 from lerobot_ufrnn.experiments import demonstrations, executors
 from lerobot_ufrnn.experiments.chain import Chain, plan, run_chain
@@ -353,7 +354,7 @@ def test_the_command_goes_on_past_a_failure_and_reports_it(protocol, monkeypatch
     monkeypatch.setattr("lerobot_ufrnn.commands.protocol.Runner", lambda: mended)
     assert main(["protocol", *flags_for(protocol)]) == 0
     assert [name for name, _ in mended.commands] == ["lerobot-train", "lerobot-eval", "lerobot-eval"]
-    assert "| one - two | +0 [" in capsys.readouterr().out
+    assert f"| two {MINUS} one | +0 [" in capsys.readouterr().out
     assert len(protocol.results.read_text().splitlines()) == 1 + 2 * 2 * 2 * 3
 
 
