@@ -1,4 +1,11 @@
-"""What else could be done: futures of perturbed copies, which of them are open, and the one to try."""
+"""What else could be done: futures that begin with other sensations, which of them are open, and the one to try.
+
+Where several ways were demonstrated, the network is uncertain of what it will sense next: its predicted variance spans
+them. So a copy that imagines to sense something other than expected, by as much as the network is uncertain of each
+value, is led into one of the ways, and the wider they part the better it gets there. The deviation is held for some
+steps, as that of a door that has begun to move would be. Noise on the hidden state itself gets there much more rarely
+the better the network has learned to lead back to its way.
+"""
 
 import math
 from collections.abc import Iterable
@@ -7,21 +14,20 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from .foresight import perturb, sample_noise
 from .networks import HiddenState, Prediction
 from .recurrent import UFRNN
 
-SETTLE = 6
-"""Imagined steps in which a perturbation settles, before a future counts."""
+DEVIATION_STEPS = 8
+"""Imagined steps for which a copy senses something other than expected, before its future counts."""
+
+SOON = 6
+"""Imagined steps after which a future that is determined is well on its way."""
 
 SAME_FUTURE = 0.2
 """Standard deviation of the kernel that calls two futures the same, as a fraction of how far futures lead."""
 
 REFUTED = 0.3
 """Likeness to a failed try above which a future is refuted."""
-
-FEWEST_ALIKE = 3
-"""Copies, itself included, that must share a future."""
 
 
 @dataclass(frozen=True)
@@ -57,47 +63,43 @@ class Alternatives:
     def imagine(
         cls,
         model: UFRNN,
-        moments: HiddenState,
+        state: HiddenState,
         num_samples: int,
         noise_range: tuple[float, float],
-        perturbed: tuple[str, ...],
         horizon: int,
         generator: Generator | None = None,
     ) -> "Alternatives":
-        """Plays the futures of perturbed copies in closed loop.
-
-        Copies are taken of all moments, since how far the noise spreads them over the ways to go on depends on the
-        moment: early it is forgotten again, late the way is already taken.
+        """Plays the futures of copies of one state, each of which begins with sensations of its own.
 
         Args:
             model (`UFRNN`):
                 The model that imagines.
-            moments (`HiddenState`):
-                States to perturb, (M, hidden size) each.
+            state (`HiddenState`):
+                State to copy, (1, hidden size) each.
             num_samples (`int`):
-                Number of copies N, in turn of each moment.
+                Number of copies N.
             noise_range (`tuple[float, float]`):
-                Range of the standard deviations of their noise, which are uniformly distributed.
-            perturbed (`tuple[str, ...]`):
-                Names of the `HiddenState` fields to perturb.
+                Range of how far sensations deviate from the predicted means, in predicted standard deviations; a
+                copy's is uniformly distributed over it and times a standard normal number for each sensor value.
             horizon (`int`):
-                Number of imagined steps T.
+                Number of imagined steps T after the deviation.
             generator (`torch.Generator`, *optional*):
                 Source of randomness.
 
         Returns:
             `Alternatives`: the futures.
         """
-        like, (low, high) = moments.h_joint, noise_range
-        first = torch.randint(len(like), (1,), generator=generator, device=like.device)
-        rows = (torch.arange(num_samples, device=like.device) + first) % len(like)
-        copies = moments.at(rows)
-        std = low + (high - low) * torch.rand(num_samples, 1, generator=generator, dtype=like.dtype, device=like.device)
-        noise = std * sample_noise(copies, 1, perturbed, generator=generator)
-        copies = perturb(copies, noise, like.new_ones(num_samples, 2), perturbed)
-        imagined = model.imagine(copies, SETTLE + horizon)
-        states = imagined.at(slice(SETTLE, None))
-        return cls(states, model.network.predict(states), model.network.joint_dim)
+        network, (low, high) = model.network, noise_range
+        copies = HiddenState(*(values.expand(num_samples, -1) for values in state))
+        like = network.predict_mean(copies)
+        scale = torch.rand(num_samples, 1, generator=generator, dtype=like.dtype, device=like.device)
+        deviation = torch.randn(like.shape, generator=generator, dtype=like.dtype, device=like.device)
+        deviation *= low + (high - low) * scale
+        for _ in range(DEVIATION_STEPS):
+            expected = network.predict(copies)
+            copies = network.step(expected.mean + deviation * (expected.log_variance / 2).exp(), copies)
+        states = model.imagine(copies, horizon)
+        return cls(states, network.predict(states), network.joint_dim)
 
     def refuted(self, failures: Iterable[tuple[float, Tensor]], here: Tensor) -> Tensor:
         """How much each future is like a failed one.
@@ -117,7 +119,7 @@ class Alternatives:
         return refuted
 
     def choose(self, refuted: Tensor, here: Tensor) -> int:
-        """The most determined of the futures that are open: those neither refuted nor an accident of the noise.
+        """The most determined of the futures that are open: those that are not refuted.
 
         A determined future is soon well on its way from where it starts to where it ends, and does not start far from
         the arm. One that wavers between two ways, as those in between do, cannot be carried out against a load.
@@ -131,15 +133,12 @@ class Alternatives:
         Returns:
             `int`: index of the future.
         """
-        soon = self.joints[min(SETTLE, len(self.joints) - 1)]
+        soon = self.joints[min(SOON, len(self.joints) - 1)]
         left = (soon - self.ends).norm(dim=-1) / (self.starts - self.ends).norm(dim=-1).clamp(min=1e-6)
         leap = (self.starts - here).norm(dim=-1) / (self.ends - here).norm(dim=-1).clamp(min=1e-6)
-        accidental = self._likeness(self.ends, here).sum(-1) < min(FEWEST_ALIKE, len(self.ends))
-        if accidental.all():
-            accidental = torch.zeros_like(accidental)  # then none is more so than another
-        closed = accidental | (refuted >= REFUTED)
+        closed = refuted >= REFUTED
         if closed.all():
-            return int(refuted.masked_fill(accidental, math.inf).argmin())
+            return int(refuted.argmin())
         return int((left + leap).masked_fill(closed, math.inf).argmin())
 
     def _likeness(self, others: Tensor, here: Tensor) -> Tensor:

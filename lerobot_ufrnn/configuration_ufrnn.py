@@ -62,17 +62,16 @@ class UFRNNConfig(PreTrainedConfig):
         recall (`bool`, *optional*, defaults to `True`):
             Whether acting goes back to a remembered state when the joints are not where they were predicted to be, and
             tries another future from there (see `recall.py`; not in the paper). Not used in training.
-        surprise_threshold (`float`, *optional*, defaults to `8.0`):
+        surprise_threshold (`float`, *optional*, defaults to `4.0`):
             Squared prediction error of the joints, in units of the predicted variance, from which to go back, if the
             arm does not move as foreseen. It is one on average while all goes as foreseen.
-        recall_rewind (`int`, *optional*, defaults to `8`):
-            Remembered moments before the last unsurprised one of which perturbed copies are taken, too.
-        recall_samples (`int`, *optional*, defaults to `180`):
-            Number of perturbed copies.
-        recall_noise (`tuple[float, float]`, *optional*, defaults to `(1.0, 2.5)`):
-            Range of the standard deviation of the perturbation. Weaker noise leaves copies wavering between two ways.
+        recall_samples (`int`, *optional*, defaults to `60`):
+            Number of imagined futures.
+        recall_noise (`tuple[float, float]`, *optional*, defaults to `(1.0, 5.0)`):
+            Range of how far the first sensations that they imagine deviate from the expected ones, in predicted
+            standard deviations.
         recall_horizon (`int`, *optional*, defaults to `60`):
-            Imagined steps by whose end the copies' futures are compared.
+            Imagined steps by whose end futures are compared.
         recall_commitment (`int`, *optional*, defaults to `24`):
             Imagined steps that are carried out, at the arm's pace, before it listens to its senses again.
         recall_memory (`float`, *optional*, defaults to `200.0`):
@@ -156,10 +155,9 @@ class UFRNNConfig(PreTrainedConfig):
     keep_unperturbed: bool = False
 
     recall: bool = True
-    surprise_threshold: float = 8.0
-    recall_rewind: int = 8
-    recall_samples: int = 180
-    recall_noise: tuple[float, float] = (1.0, 2.5)
+    surprise_threshold: float = 4.0
+    recall_samples: int = 60
+    recall_noise: tuple[float, float] = (1.0, 5.0)
     recall_horizon: int = 60
     recall_commitment: int = 24
     recall_memory: float = 200.0
@@ -213,7 +211,7 @@ class UFRNNConfig(PreTrainedConfig):
             *("conv_first_stride", "recall_samples", "recall_horizon"),
         ):
             self._require(name, getattr(self, name) >= 1, "at least 1")
-        for name in ("image_shift", "drop_n_last_frames", "recall_rewind", "recall_commitment"):
+        for name in ("image_shift", "drop_n_last_frames", "recall_commitment"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         for name in ("image_jitter", "image_noise", "input_noise", "input_noise_correlation"):
             self._require(name, 0 <= getattr(self, name) < 1, "from 0 to below 1")

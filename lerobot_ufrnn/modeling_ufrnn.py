@@ -104,7 +104,6 @@ class UFRNNPolicy(PreTrainedPolicy):
             self.recall = Recall(
                 self.model,
                 config.surprise_threshold,
-                config.recall_rewind,
                 config.recall_samples,
                 config.recall_noise,
                 config.recall_horizon,

@@ -9,10 +9,9 @@ standard deviation. Recall, our addition to the paper, acts on it, at run time o
    all goes as foreseen, is smoothed over a few steps and compared with a threshold. It counts only while the arm does
    not make the foreseen movement: one that lags under a load is not wrong.
 2. **Go back.** The arm returns to its pose of the last moment before the surprise. What it was doing is refuted.
-3. **Imagine.** Perturbed copies of the moments around that one play their futures to a long horizon, in closed loop
-   (`alternatives.py`).
-4. **Select.** Futures that end where a try has failed are refuted, and those that hardly any other copy shares are
-   accidents of the noise. Of the rest the most determined is kept.
+3. **Imagine.** Copies of that moment imagine to sense something other than expected, by as much as the network was
+   uncertain of it, and play their futures to a long horizon, in closed loop (`alternatives.py`).
+4. **Select.** Futures that end where a try has failed are refuted. Of the rest the most determined is kept.
 5. **Carry out** its first steps as imagined, at the arm's pace (`attempt.py`); then listen again. If the arm is
    blocked, that future is refuted, too, and 2 follows again.
 """
@@ -42,11 +41,8 @@ CALM = 0.5
 LONGEST_RETURN = 6
 """Steps that the arm has for going back to the remembered pose."""
 
-AHEAD = 6
-"""Imagined moments after the last calm one that are perturbed, too."""
-
-TRAIL_MARGIN = 24
-"""Remembered moments beyond those that may be perturbed, for those that were surprising."""
+LONGEST_TRAIL = 32
+"""Remembered steps; the last calm moment is looked for in these."""
 
 
 def surprise(joints: Tensor, prediction: Prediction) -> Tensor:
@@ -100,7 +96,6 @@ class _Episode:
     step: int = -1
     surprise: float = 0.0
     anchor: _Moment | None = None  # the last one before the surprise
-    moments: HiddenState | None = None  # where another future may still be open, (M, hidden size) each
     attempt: Attempt | None = None
     refuted: list[tuple[int, Tensor]] = field(default_factory=list)  # step of failure, where the future ends
     events: list[RecallEvent] = field(default_factory=list)
@@ -109,21 +104,19 @@ class _Episode:
 class Recall:
     """Steps a model and goes back on surprise; state lives from `reset` to `reset`.
 
-    The hidden state is perturbed when surprised and only then: noise at every step would look like a contradiction.
-    With `exploration=foresight` futures are imagined and selected. The baselines go back too: `noise` goes on with any
-    one perturbed copy, `none` with one of the moments itself.
+    It explores when surprised and only then: noise at every step would look like a contradiction. With
+    `exploration=foresight` futures are imagined and selected. The baselines go back too: `noise` goes on with any one
+    copy that deviates, `none` with the moment itself.
 
     Args:
         model (`UFRNN`):
             The model to step.
         threshold (`float`):
             Surprise from which to go back.
-        rewind (`int`):
-            Remembered moments before the last unsurprised one whose copies are perturbed, too.
         num_samples (`int`):
-            Number of perturbed copies.
+            Number of imagined futures.
         noise_range (`tuple[float, float]`):
-            Range of the standard deviation of the perturbation.
+            Range of how far their first sensations deviate, in predicted standard deviations.
         horizon (`int`):
             Imagined steps by whose end futures are compared.
         commitment (`int`):
@@ -136,7 +129,6 @@ class Recall:
         self,
         model: UFRNN,
         threshold: float,
-        rewind: int,
         num_samples: int,
         noise_range: tuple[float, float],
         horizon: int,
@@ -144,10 +136,8 @@ class Recall:
         memory: float,
     ):
         self.exploration = model.foresight.exploration
-        self.perturbed = model.foresight.perturbed
         self.model = type(model)(model.network, Foresight("none", model.foresight.schedule, num_samples=1, horizon=1))
         self.threshold = threshold
-        self.rewind = rewind
         self.num_samples = num_samples if self.exploration == "foresight" else 1
         self.noise_range = (0.0, 0.0) if self.exploration == "none" else noise_range
         self.horizon = horizon
@@ -185,8 +175,7 @@ class Recall:
         """
         joints = inputs[:, : self.model.network.joint_dim]
         if self._joints is None:
-            longest = self.rewind + 1 + TRAIL_MARGIN
-            self._episodes = [_Episode(deque(maxlen=longest)) for _ in range(len(inputs))]
+            self._episodes = [_Episode(deque(maxlen=LONGEST_TRAIL)) for _ in range(len(inputs))]
             self._joints = joints
         surprises = surprise(joints, memory.prediction)
         moves = progress(self._joints, joints, memory.prediction.mean[:, : joints.shape[-1]]) >= STALLED
@@ -221,7 +210,7 @@ class Recall:
             episode.surprise *= SMOOTHING
             if not moves:
                 episode.surprise += (1 - SMOOTHING) * surprise_now
-            if episode.surprise > self.threshold and len(episode.trail) > self.rewind:
+            if episode.surprise > self.threshold and episode.trail:
                 self._remember(episode, state)
                 return self._go_back(episode, generator)
             episode.trail.append(_Moment(episode.step, state, episode.surprise))
@@ -241,15 +230,12 @@ class Recall:
         return None
 
     def _remember(self, episode: _Episode, state: HiddenState) -> None:
-        """Takes what was being done as refuted, and the moments around the last calm one as those to go on from."""
-        trail = episode.trail
+        """Takes what was being done as refuted, and the last calm moment as the one to go on from."""
         episode.refuted.append((episode.step, self._foresee(state)))
+        trail = episode.trail
         while len(trail) > 1 and trail[-1].surprise > CALM * self.threshold:
             trail.pop()
         episode.anchor = trail[-1]
-        remembered = [moment.state for moment in list(trail)[-1 - self.rewind : -1]]
-        states = [*remembered, self.model.imagine(episode.anchor.state, AHEAD).at((slice(None), 0))]
-        episode.moments = HiddenState(*(torch.cat(values) for values in zip(*states, strict=True)))
 
     def _foresee(self, state: HiddenState) -> Tensor:
         """Scaled joints where this state is leading, (D_j,)."""
@@ -260,9 +246,8 @@ class Recall:
         """Decides on another future and returns to the moment before the surprise."""
         network, anchor = self.model.network, episode.anchor
         assert anchor is not None
-        assert episode.moments is not None
         found = Alternatives.imagine(
-            self.model, episode.moments, self.num_samples, self.noise_range, self.perturbed, self.horizon, generator
+            self.model, anchor.state, self.num_samples, self.noise_range, self.horizon, generator
         )
         here = network.predict_mean(anchor.state)[0, : network.joint_dim]
         refuted = found.refuted(self._failures(episode), here)

@@ -63,7 +63,6 @@ def test_a_saved_configuration_loads_equal(tmp_path):
         ("image_noise", 1.5, "below 1"),
         ("recall_samples", 0, "at least 1"),
         ("recall_horizon", 0, "at least 1"),
-        ("recall_rewind", -1, "at least 0"),
         ("surprise_threshold", 1.0, "above 1"),
         ("surprise_threshold", float("inf"), "above 1"),
         ("recall_commitment", -1, "at least 0"),

@@ -124,7 +124,7 @@ def test_with_recall_a_policy_that_is_never_surprised_acts_without_noise(dataset
 
 
 def test_with_recall_a_surprised_policy_goes_back_until_it_is_reset(dataset):
-    policy = make_trained(dataset, surprise_threshold=1.01, recall_rewind=1, recall_samples=5)
+    policy = make_trained(dataset, surprise_threshold=1.01, recall_samples=5)
     far = observation(1)
     far["observation.state"] += 5
     for _ in range(20):

@@ -10,31 +10,29 @@ from small_network import FEATURES, JOINTS, in_closed_loop, is_close, is_equal, 
 
 from lerobot_ufrnn import alternatives as alternatives_module
 from lerobot_ufrnn import recall as recall_module
-from lerobot_ufrnn.alternatives import REFUTED, SETTLE, Alternatives
+from lerobot_ufrnn.alternatives import DEVIATION_STEPS, REFUTED, SOON, Alternatives
 from lerobot_ufrnn.attempt import FIRST_STEPS, PATIENCE
 from lerobot_ufrnn.foresight import Foresight, NoiseSchedule
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
 from lerobot_ufrnn.networks import HiddenState, Prediction
-from lerobot_ufrnn.recall import AHEAD, LONGEST_RETURN, STALLED, TRAIL_MARGIN, Recall, surprise
+from lerobot_ufrnn.recall import LONGEST_RETURN, LONGEST_TRAIL, STALLED, Recall, surprise
 from lerobot_ufrnn.recurrent import UFRNN, Memory
 
 # With a surprise of 6 at each step, the running surprise is 3, which is above half the threshold, and then 4.5.
 THRESHOLD, CONTRADICTION, STEPS_TO_FIRE = 4.0, 6.0, 2
-REWIND, HORIZON, COMMITMENT, CALM_STEPS = 3, 24, 12, 10
-MOMENTS = REWIND + 1 + AHEAD
+SAMPLES, HORIZON, COMMITMENT, CALM_STEPS = 5, 24, 12, 10
 ANCHOR, FIRED = CALM_STEPS - 1, CALM_STEPS + STEPS_TO_FIRE - 1
 UNTIL_BLOCKED = 1 + FIRST_STEPS + PATIENCE + 1
 """Steps after which an arm that does not move is known to be blocked."""
 
 
 def make_recall(kernel=UFRNN, exploration="foresight", **overrides) -> Recall:
-    """Recall of a small network, whose copies of one moment are all alike unless a test asks for noise."""
+    """Recall of a small network, whose futures are all alike unless a test asks for noise."""
     schedule = NoiseSchedule((0.05, 0.15), "std", False)
     model = kernel(small_network(), Foresight(exploration, schedule, 5, 3)).double()
     settings = {
         "threshold": THRESHOLD,
-        "rewind": REWIND,
-        "num_samples": MOMENTS,
+        "num_samples": SAMPLES,
         "noise_range": (0.0, 0.0),
         "horizon": HORIZON,
         "commitment": COMMITMENT,
@@ -141,11 +139,9 @@ def surprised_world(**overrides) -> World:
     return world
 
 
-def unperturbed(world: World, anchor: int = ANCHOR) -> list[list[np.ndarray]]:
-    """What begins with each of the moments around the anchor without noise, by the oracle."""
-    moments = [world.state(step) for step in range(anchor - REWIND, anchor + 1)]
-    moments += in_closed_loop(world.network, moments[-1], AHEAD)[1:]
-    return [in_closed_loop(world.network, moment, SETTLE)[-1] for moment in moments]
+def undisturbed(world: World) -> list[np.ndarray]:
+    """What begins at the anchor without noise, by the oracle."""
+    return in_closed_loop(world.network, world.state(ANCHOR), DEVIATION_STEPS)[-1]
 
 
 # ── Surprise ──────────────────────────────────────────────────────────
@@ -222,11 +218,10 @@ def test_an_arm_that_lags_is_no_surprise_as_long_as_it_makes_enough_of_the_movem
 
 def test_it_does_not_go_back_before_there_is_anywhere_to_go():
     world = World(make_recall())
-    for _ in range(REWIND + 1):
-        world.step(CONTRADICTION, exact=False)
+    world.step(2 * THRESHOLD + 0.01, exact=False)
     assert not world.events
-    world.step(CONTRADICTION, exact=False)
-    assert [event.step for event in world.events] == [REWIND + 1]
+    world.step(2 * THRESHOLD + 0.01, exact=False)
+    assert [(event.step, event.steps_back) for event in world.events] == [(1, 1)]
 
 
 # ── Going back ────────────────────────────────────────────────────────
@@ -238,8 +233,8 @@ def test_it_goes_back_to_the_last_calm_moment():
     assert torch.equal(world.now.prediction.command, world.memories[ANCHOR].prediction.command)
     (event,) = world.events
     assert (event.step, event.steps_back) == (FIRED, FIRED - ANCHOR) == (11, 2)
-    assert event.refuted.shape == (MOMENTS,)
-    assert event.futures.mean.shape == (HORIZON, MOMENTS, JOINTS + FEATURES)
+    assert event.refuted.shape == (SAMPLES,)
+    assert event.futures.mean.shape == (HORIZON, SAMPLES, JOINTS + FEATURES)
 
 
 @pytest.mark.parametrize(("contradiction", "is_calm"), [(THRESHOLD - 0.01, True), (THRESHOLD + 0.01, False)])
@@ -256,10 +251,10 @@ def test_a_moment_is_calm_up_to_half_of_the_threshold(contradiction, is_calm):
 def test_a_long_doubt_is_remembered_only_as_far_as_the_trail_goes():
     world = World(make_recall())
     world.steps(CALM_STEPS)
-    world.steps(2 * TRAIL_MARGIN, 0.75 * THRESHOLD)  # neither calm nor surprised
+    world.steps(2 * LONGEST_TRAIL, 0.75 * THRESHOLD)  # neither calm nor surprised
     assert not world.events
     world.surprise()
-    assert world.events[0].steps_back == REWIND + 1 + TRAIL_MARGIN
+    assert world.events[0].steps_back == LONGEST_TRAIL
 
 
 @pytest.mark.parametrize("waits", [0, 1, 3, LONGEST_RETURN - 1, LONGEST_RETURN + 5])
@@ -272,14 +267,14 @@ def test_it_waits_in_the_remembered_state_until_the_arm_is_back_but_not_for_ever
         assert is_equal(world.now.state, anchor.state)
         assert torch.equal(world.now.prediction.command, anchor.prediction.command)
     world.step(THRESHOLD - 0.01 if waits < LONGEST_RETURN else THRESHOLD + 0.01, share=1.0)
-    assert any(is_close(world.now.state, begun) for begun in unperturbed(world))
+    assert is_close(world.now.state, undisturbed(world))
 
 
 def test_it_does_not_wait_for_an_arm_that_stands_still():
     world = surprised_world()
     assert surprise(world.before, world.now.prediction).item() > THRESHOLD
     world.stand()
-    assert any(is_close(world.now.state, begun) for begun in unperturbed(world))
+    assert is_close(world.now.state, undisturbed(world))
 
 
 def test_it_waits_as_long_each_time():
@@ -300,22 +295,19 @@ def test_it_waits_as_long_each_time():
 # ── Imagining ─────────────────────────────────────────────────────────
 
 
-def test_the_moments_are_those_around_the_last_calm_one_in_their_order():
-    world = surprised_world(num_samples=2 * MOMENTS)
-    begun, oracle = unperturbed(world), Oracle(world.network)
-    first_steps = [oracle.imagine(state, 1)[0][0] for state in begun]
-    found = world.events[0].futures.mean[0].numpy()
-    first = next(row for row in range(MOMENTS) if np.allclose(found[0], first_steps[row], atol=1e-10))
-    for copy in range(2 * MOMENTS):
-        np.testing.assert_allclose(found[copy], first_steps[(first + copy) % MOMENTS], atol=1e-10)
+def test_without_noise_all_futures_are_that_of_the_last_calm_moment():
+    world = surprised_world()
+    expected = Oracle(world.network).imagine(undisturbed(world), HORIZON)
+    for copy in range(SAMPLES):
+        np.testing.assert_allclose(world.events[0].futures.mean[:, copy], [mean for mean, *_ in expected], atol=1e-10)
 
 
 @pytest.mark.parametrize("exploration", ["noise", "none"])
-def test_a_baseline_has_one_future_and_only_that_with_noise_is_perturbed(exploration):
+def test_a_baseline_has_one_future_and_only_that_with_noise_deviates(exploration):
     world = surprised_world(exploration=exploration, num_samples=50, noise_range=(0.5, 0.5))
     assert len(world.events[0].refuted) == 1
     world.step()
-    assert any(is_close(world.now.state, begun) for begun in unperturbed(world)) == (exploration == "none")
+    assert is_close(world.now.state, undisturbed(world)) == (exploration == "none")
 
 
 @pytest.mark.parametrize("exploration", ["foresight", "noise", "none"])
@@ -329,7 +321,7 @@ def test_a_generator_makes_it_reproducible(exploration):
         return world.now.state
 
     assert is_equal(last_state(1), last_state(1))
-    assert not torch.equal(last_state(1).h_joint, last_state(2).h_joint)
+    assert torch.equal(last_state(1).h_joint, last_state(2).h_joint) == (exploration == "none")
 
 
 # ── Trying ────────────────────────────────────────────────────────────
@@ -444,11 +436,11 @@ def script(monkeypatch, doing: tuple[float, ...]) -> None:
     ends = torch.tensor(WAYS, dtype=torch.float64)
     left = torch.tensor([{RIGHT: 0.1, LEFT: 0.2, UP: 0.3}[way] - 0.01 * (row % 4) for row, way in enumerate(WAYS)])
 
-    def imagine(model, moments, *settings):
-        states = model.imagine(moments.at([REWIND] * len(WAYS)), HORIZON)
-        mean = model.network.predict_mean(states)  # what is carried out is true; it ends before it settles
+    def imagine(model, state, *settings):
+        states = model.imagine(state.at([0] * len(WAYS)), HORIZON)
+        mean = model.network.predict_mean(states)  # what is carried out is true; it ends before `SOON`
         here = mean[0, :, :JOINTS]
-        mean[SETTLE, :, :JOINTS] = ends + left[:, None] * (here - ends)
+        mean[SOON, :, :JOINTS] = ends + left[:, None] * (here - ends)
         mean[-1, :, :JOINTS] = ends
         nothing = mean.new_empty(1 + HORIZON, len(WAYS), 0)
         return Alternatives(states, Prediction(mean, mean, nothing, nothing), JOINTS)
@@ -462,7 +454,7 @@ def script(monkeypatch, doing: tuple[float, ...]) -> None:
 
 def failing_world(failures: int, **overrides) -> World:
     """Every try is blocked."""
-    world = World(make_recall(commitment=SETTLE - 1, **overrides))
+    world = World(make_recall(commitment=SOON - 1, **overrides))
     world.steps(CALM_STEPS)
     world.surprise()
     for _ in range(failures):
@@ -594,7 +586,7 @@ def test_a_thousand_steps_of_any_kind_are_survived_in_bounded_memory():
             lengths.append(len(episode.trail))
             assert len(episode.refuted) <= len(world.events)
         events.append(len(world.events))
-    assert max(lengths) == REWIND + 1 + TRAIL_MARGIN
+    assert max(lengths) == LONGEST_TRAIL
     assert events[0] > 10
     assert events[1] > events[0] + 3
     assert all(torch.isfinite(values).all() for values in world.now.state)

@@ -73,7 +73,7 @@ def test_a_trial_is_kept_step_by_step(dataset, exploration):
 
 
 def test_with_recall_what_is_imagined_is_kept_of_the_steps_that_surprised(dataset):
-    policy = trained(dataset, "foresight", recall_rewind=2, recall_horizon=9, recall_commitment=4)
+    policy = trained(dataset, "foresight", recall_horizon=9, recall_commitment=4)
     policy.recall.threshold = 0.01  # so little trained, it expects to be wrong
     history = run_trial(policy, Playback(dataset, {}), seed=0)
     events = policy.recall.events[0]
