@@ -14,6 +14,7 @@ COMMANDS = {
     "protocol": "train and evaluate models x seeds x checkpoints, resumably; table of all results",
     "curve": "draw the success rate over the epochs of training from that table",
     "hidden": "draw hidden states along the demonstrations and in a trial, model by model",
+    "drift": "measure how far imagined futures drift from the demonstrations",
     "lyapunov": "draw how chaotic the imagined futures are along the demonstrations",
     "report": "put all results, tables, pictures and videos into one page",
     "benchmark": "time it against the readable code, XLA, ACT and Diffusion Policy",

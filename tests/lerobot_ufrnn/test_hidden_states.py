@@ -5,10 +5,13 @@ import numpy as np
 import pytest
 import torch
 from lerobot.policies.factory import make_policy
+from oracle import Oracle
 from sklearn.decomposition import PCA
 from small import batch_of, small_config, train
+from small_network import in_closed_loop, row_of
 
 from lerobot_ufrnn.analysis import hidden_picture, lyapunov_picture
+from lerobot_ufrnn.analysis.drift import imagined_drift
 from lerobot_ufrnn.analysis.hidden_picture import HiddenPaths
 from lerobot_ufrnn.analysis.hidden_states import Plane, read_demonstrations, states_along
 from lerobot_ufrnn.analysis.lyapunov import exponents_over_time
@@ -44,6 +47,23 @@ def test_states_are_found_along_demonstrations_of_any_length(uneven_dataset, exp
     if exploration == "none":
         (alone,) = states_along(policy, demonstrations[2:])
         torch.testing.assert_close(states[2], alone)
+
+
+def test_drift_is_the_mean_distance_of_imagined_poses_from_the_nearest_demonstrated_one(uneven_dataset):
+    policy = make_policy(small_config(exploration="none"), ds_meta=uneven_dataset.meta)
+    train(policy, [batch_of(0, 1, 2)] * 3)
+    policy.eval()
+    demonstrations = read_demonstrations(policy, uneven_dataset.root)
+    poses = torch.cat([policy.joint_scaler.scale(episode.states) for episode in demonstrations]).numpy()
+    network = policy.model.network
+    for states, drift in zip(
+        states_along(policy, demonstrations), imagined_drift(policy, demonstrations, 4), strict=True
+    ):
+        for start in range(len(drift)):
+            imagined = in_closed_loop(network, row_of(states, start), 4)
+            means = [Oracle(network).predict(state)[0][: network.joint_dim] for state in imagined]
+            nearest = [min(np.linalg.norm(mean - pose) for pose in poses) for mean in means]
+            assert drift[start] == pytest.approx(np.mean(nearest), abs=1e-5)
 
 
 def test_a_folder_without_a_dataset_is_refused(tmp_path):
