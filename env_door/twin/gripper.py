@@ -1,0 +1,213 @@
+"""A Robotiq 2F-85: its variables, what they do to the fingers, and the socket of its URCap on port 63352.
+
+The fingers go at the speed that was set towards the position that was asked for, stop at what is in between and keep
+squeezing with the force that was set. Position 0 is open and 255 closed, exactly: a real gripper reads some 3 to 230.
+"""
+
+from env_door.twin.lines import LinePeer
+from env_door.twin.network import Connection
+
+STROKE_SPEEDS = (0.235, 1.765)
+"""Slowest and fastest closing in strokes per second (20 and 150 mm/s of 85 mm)."""
+
+FORCES = (20.0, 235.0)
+"""Weakest and strongest grip in N; the scene's gripper ends at 140 N."""
+
+ACTIVATION_SECONDS = 1.0
+"""Time that activation takes. The real gripper closes and opens meanwhile; this one only opens."""
+
+BLOCKED_SECONDS = 0.06
+"""Time for which the fingers must stand still short of the target to count as stopped by an object."""
+
+NOT_ACTIVATED = 7
+"""Fault: asked to move before it was activated. Ends with activation."""
+
+ACTIVATING_FAULT = 5
+"""Fault: asked to move while it is being activated. Ends with activation, after which it moves."""
+
+MAJOR_FAULT = 10
+"""Faults from here on stop the gripper until it is activated again (`SET ACT 0`, then `SET ACT 1`)."""
+
+RESET, ACTIVATING, ACTIVE = 0, 1, 3
+MOVING, BLOCKED_OPENING, BLOCKED_CLOSING, AT_TARGET = 0, 1, 2, 3
+
+
+class Gripper:
+    """The gripper's variables and the closure it drives its fingers to.
+
+    Attributes:
+        target (`float`): Closure to drive the fingers to, 0 open to 1 closed.
+        silent (`bool`): Whether the socket answers nothing.
+        garbage (`bool`): Whether the socket answers nonsense.
+        cause (`int`): Fault that comes back with every activation; 0 for none.
+    """
+
+    def __init__(self) -> None:
+        self.silent = self.garbage = False
+        self.cause = 0
+        self.switch_off()
+
+    def switch_off(self) -> None:
+        """Takes its power away: afterwards it must be activated."""
+        self.powered = False
+        self._set = {"ACT": 0, "GTO": 0, "ATR": 0, "ARD": 0, "FOR": 0, "SPE": 0, "POS": 0}
+        self._status, self._fault, self._object = RESET, 0, MOVING
+        self._activating = self._still = 0.0
+        self.target = self._measured = 0.0
+
+    def switch_on(self, closure: float) -> None:
+        """Gives it power again.
+
+        Args:
+            closure (`float`):
+                Measured closure, where the fingers stay.
+        """
+        self.powered = True
+        self.target = self._measured = closure
+
+    def open_at_once(self) -> None:
+        """Forgets the last request: a new trial starts with open fingers. An activated gripper stays activated."""
+        self._set["POS"] = 0
+        self.target = self._measured = 0.0
+
+    @property
+    def force(self) -> float:
+        """`float`: force in N with which it squeezes."""
+        return FORCES[0] + (FORCES[1] - FORCES[0]) * self._set["FOR"] / 255
+
+    def fail(self, code: int) -> None:
+        """Breaks it.
+
+        Args:
+            code (`int`):
+                Fault that it shows, 1 to 15; 0 takes the cause away, though a major fault lasts until it is activated.
+        """
+        self.cause = code
+        if code or self._fault < MAJOR_FAULT:
+            self._fault = code
+
+    def step(self, closure: float, seconds: float) -> None:
+        """Goes on in time.
+
+        Args:
+            closure (`float`):
+                Measured closure, 0 open to 1 closed.
+            seconds (`float`):
+                Time since the last step in s.
+        """
+        moved, self._measured = abs(closure - self._measured), closure
+        if self._status == ACTIVATING:
+            self._activating -= seconds
+            self._approach(0.0, seconds)
+            if self._activating <= 0:
+                self._status, self._fault = ACTIVE, self.cause
+        elif self._status == ACTIVE and self._set["GTO"] and self._fault < MAJOR_FAULT:
+            self._approach(self._set["POS"] / 255, seconds)
+        self._still = self._still + seconds if moved < 0.02 * seconds else 0.0
+        self._object = self._detect(closure)
+
+    def _approach(self, goal: float, seconds: float) -> None:
+        slow, fast = STROKE_SPEEDS
+        step = (slow + (fast - slow) * self._set["SPE"] / 255) * seconds
+        self.target += min(max(goal - self.target, -step), step)
+
+    def _detect(self, closure: float) -> int:
+        goal = self._set["POS"] / 255
+        if self._still < BLOCKED_SECONDS or not self._set["GTO"]:
+            return MOVING
+        if abs(goal - closure) <= 3 / 255:
+            return AT_TARGET
+        # Only fingers that push and do not move have met something.
+        if abs(self.target - closure) < 0.01:
+            return MOVING
+        return BLOCKED_CLOSING if self.target > closure else BLOCKED_OPENING
+
+    def get(self, name: str) -> str:
+        """Value of a variable.
+
+        Args:
+            name (`str`):
+                Its three letters.
+
+        Returns:
+            `str`: a whole number, or `"?"` for an unknown variable and while the gripper has no power.
+        """
+        if not self.powered:
+            return "?"
+        status = {
+            "STA": self._status,
+            "OBJ": self._object,
+            "FLT": self._fault,
+            "POS": round(min(max(self._measured, 0.0), 1.0) * 255),
+            "PRE": self._set["POS"],
+        }
+        return str((self._set | status).get(name, "?"))
+
+    def set(self, values: dict[str, int]) -> bool:
+        """Sets variables.
+
+        Args:
+            values (`dict[str, int]`):
+                New values by name.
+
+        Returns:
+            `bool`: whether they were taken; `False` leaves all as they were.
+        """
+        if not self.powered or not values:
+            return False
+        if any(name not in self._set or not 0 <= value <= 255 for name, value in values.items()):
+            return False
+        was_active = self._set["ACT"]
+        self._set |= values
+        if values.get("ACT") == 0:
+            self._status, self._fault = RESET, 0
+            self._set["GTO"] = 0
+            self.target = self._measured
+        elif self._set["ACT"] and not was_active:
+            self._status, self._fault, self._activating = ACTIVATING, self.cause, ACTIVATION_SECONDS
+            self._set["POS"] = values.get("POS", 0)
+        elif self._status == ACTIVATING and "POS" in values:
+            self._fault = self._fault or ACTIVATING_FAULT
+        if "GTO" in values or "POS" in values:
+            self._start_moving()
+        return True
+
+    def _start_moving(self) -> None:
+        if self._status == RESET and self._set["GTO"]:
+            self._fault = NOT_ACTIVATED
+        elif not self._set["GTO"]:
+            self.target = self._measured
+        self._still, self._object = 0.0, MOVING
+
+
+class GripperSocket(LinePeer):
+    """The URCap's text protocol: `SET ACT 1 GTO 1 ...` is answered by `ack` and `GET POS` by `POS 3`.
+
+    Args:
+        connection (`Connection`):
+            The connection.
+        gripper (`Gripper`):
+            The gripper.
+    """
+
+    def __init__(self, connection: Connection, gripper: Gripper):
+        super().__init__(connection)
+        self._gripper = gripper
+
+    def line(self, line: str) -> None:
+        """Answers one request."""
+        if self._gripper.silent:
+            return
+        self.connection.send(b"\xff\x00#?!\n" if self._gripper.garbage else self._answer(line.split()).encode())
+
+    def _answer(self, words: list[str]) -> str:
+        if len(words) == 2 and words[0] == "GET":
+            return f"{words[1]} {self._gripper.get(words[1])}\n"
+        if words[:1] == ["SET"] and len(words) % 2:
+            try:
+                values = {name: round(float(value)) for name, value in zip(words[1::2], words[2::2], strict=True)}
+            except (ValueError, OverflowError):
+                return "?\n"
+            # Clients compare with exactly these three letters: no end of line.
+            return "ack" if self._gripper.set(values) else "?\n"
+        return "?\n"

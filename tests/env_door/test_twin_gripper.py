@@ -1,0 +1,141 @@
+import pytest
+
+from env_door.twin.gripper import Gripper, GripperSocket
+
+STEP = 0.002
+
+
+class Fingers:
+    """Fingers that follow their target unless an object is between them."""
+
+    def __init__(self, gripper, object_at=None):
+        self.gripper, self.object_at, self.closure = gripper, object_at, 0.0
+
+    def run(self, seconds):
+        for _ in range(round(seconds / STEP)):
+            self.gripper.step(self.closure, STEP)
+            self.closure = self.gripper.target
+            if self.object_at is not None:
+                self.closure = min(self.closure, self.object_at)
+        return self
+
+
+class Line:
+    def __init__(self):
+        self.sent = b""
+
+    def send(self, data):
+        self.sent += data
+
+
+@pytest.fixture
+def gripper():
+    made = Gripper()
+    made.switch_on(0.0)
+    return made
+
+
+@pytest.fixture
+def active(gripper):
+    gripper.set({"ACT": 1})
+    Fingers(gripper).run(1.1)
+    return gripper
+
+
+def test_activation_takes_a_moment(gripper):
+    assert gripper.get("STA") == "0"
+    gripper.set({"ACT": 1})
+    fingers = Fingers(gripper).run(0.5)
+    assert gripper.get("STA") == "1"
+    fingers.run(0.6)
+    assert gripper.get("STA") == "3"
+
+
+def test_it_does_not_move_before_it_is_activated(gripper):
+    gripper.set({"GTO": 1, "SPE": 255, "POS": 255})
+    assert Fingers(gripper).run(1.0).closure == 0.0
+    assert gripper.get("FLT") == "7"
+
+
+@pytest.mark.parametrize(("speed", "seconds"), [(255, 85 / 150), (0, 85 / 20)])
+def test_closing_takes_the_time_of_the_real_gripper(active, speed, seconds):
+    active.set({"GTO": 1, "SPE": speed, "FOR": 100, "POS": 255})
+    fingers = Fingers(active).run(0.95 * seconds)
+    assert active.get("OBJ") == "0"
+    assert fingers.closure < 1.0
+    fingers.run(0.05 * seconds + 0.1)
+    assert (active.get("POS"), active.get("OBJ"), active.get("PRE")) == ("255", "3", "255")
+
+
+def test_an_object_is_detected_and_squeezed(active):
+    active.set({"GTO": 1, "SPE": 255, "FOR": 255, "POS": 255})
+    Fingers(active, object_at=0.6).run(1.0)
+    assert (active.get("OBJ"), active.get("POS")) == ("2", str(round(0.6 * 255)))
+    assert active.target == pytest.approx(1.0)
+
+
+def test_without_goto_it_stays(active):
+    active.set({"GTO": 1, "SPE": 255, "POS": 255})
+    fingers = Fingers(active).run(0.2)
+    active.set({"GTO": 0})
+    assert fingers.closure == pytest.approx(fingers.run(0.5).closure, abs=0.01)
+
+
+def test_a_major_fault_stops_it_until_it_is_activated_again(active):
+    active.set({"GTO": 1, "SPE": 255, "POS": 255})
+    fingers = Fingers(active).run(0.2)
+    active.fail(14)
+    stopped_at = fingers.closure
+    assert fingers.run(0.5).closure == pytest.approx(stopped_at, abs=0.01)
+    active.fail(0)
+    assert active.get("FLT") == "14"
+    active.set({"ACT": 0})
+    active.set({"ACT": 1})
+    fingers.run(1.1)
+    assert (active.get("FLT"), active.get("STA")) == ("0", "3")
+
+
+def test_without_power_it_answers_with_question_marks_and_forgets_its_activation(active):
+    active.switch_off()
+    assert active.get("POS") == "?"
+    active.switch_on(0.2)
+    assert active.get("STA") == "0"
+
+
+@pytest.mark.parametrize(
+    ("request_line", "answer"),
+    [
+        ("GET POS", b"POS 0\n"),
+        ("GET STA", b"STA 3\n"),
+        ("SET POS 200 SPE 255 FOR 1 GTO 1", b"ack"),
+        ("SET POS 256", b"?\n"),
+        ("SET XXX 1", b"?\n"),
+        ("SET POS", b"?\n"),
+        ("SET POS nan", b"?\n"),
+        ("hello", b"?\n"),
+    ],
+)
+def test_socket(active, request_line, answer):
+    line = Line()
+    GripperSocket(line, active).received(request_line.encode() + b"\n")
+    assert line.sent == answer
+
+
+def test_socket_takes_split_and_joined_lines(active):
+    line = Line()
+    socket = GripperSocket(line, active)
+    socket.received(b"GET P")
+    assert line.sent == b""
+    socket.received(b"OS\nGET STA\n")
+    assert line.sent == b"POS 0\nSTA 3\n"
+
+
+def test_silence_and_garbage(active):
+    line = Line()
+    active.silent = True
+    GripperSocket(line, active).received(b"GET POS\n")
+    assert line.sent == b""
+    active.silent, active.garbage = False, True
+    GripperSocket(line, active).received(b"GET POS\n")
+    assert line.sent
+    assert not line.sent.startswith(b"POS")
