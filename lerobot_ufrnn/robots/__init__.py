@@ -1,0 +1,1 @@
+"""Robots that the policy is deployed on."""

@@ -1,0 +1,162 @@
+"""Robotiq 2F-85 through the socket that its URCap opens on the controller."""
+
+import contextlib
+import logging
+import socket
+import threading
+import time
+
+from .configuration_ur5e_robotiq import UR5eRobotiqConfig
+from .errors import Fault, RobotFaultError
+
+logger = logging.getLogger(__name__)
+
+TIMEOUT = 1.0
+"""Seconds that the gripper may take to answer."""
+
+ACTIVATION_SECONDS = 15.0
+"""Seconds that activating may take: it opens and closes once."""
+
+POLL_SECONDS = 0.05
+ACTIVE = 3
+FULL = 255
+
+
+class Gripper:
+    """Follows a target and knows where it is; a thread of its own does the asking.
+
+    The socket takes tens of milliseconds to answer, too long for a control loop to wait for.
+
+    Args:
+        config (`UR5eRobotiqConfig`):
+            Address, force, speed and range.
+    """
+
+    def __init__(self, config: UR5eRobotiqConfig):
+        self._config = config
+        self._open, self._closed = config.gripper_range
+        self._socket: socket.socket | None = None
+        self._rest = b""
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._target: int | None = None
+        self._position = self._open
+        self._fault: RobotFaultError | None = None
+
+    def connect(self) -> None:
+        """Connects and, if it is not active yet, activates the gripper, which then opens and closes once.
+
+        Raises:
+            RobotFaultError: If it does not answer, or has a fault.
+        """
+        config = self._config
+        try:
+            self._socket = socket.create_connection((config.ip, config.gripper_port), TIMEOUT)
+            self._socket.settimeout(TIMEOUT)
+            self._check_fault()
+            if self._get("STA") != ACTIVE:
+                self._activate()
+            self._set(GTO=1, SPE=round(FULL * config.gripper_speed), FOR=round(FULL * config.gripper_force))
+            self._position = self._get("POS")
+        except RobotFaultError:  # which is an OSError, too
+            self.disconnect()
+            raise
+        except (OSError, ValueError) as error:
+            self.disconnect()
+            raise RobotFaultError(
+                Fault.GRIPPER_SILENT, f"the gripper at {config.ip}:{config.gripper_port} does not answer ({error})"
+            ) from error
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._follow, name="gripper", daemon=True)
+        self._thread.start()
+
+    def disconnect(self) -> None:
+        """Lets go of the socket; the gripper stays as it is, so that it drops nothing. Safe to call at any time."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=2 * TIMEOUT)
+            self._thread = None
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.close()
+            self._socket = None
+
+    @property
+    def closure(self) -> float:
+        """`float`: measured closure from 0, open, to 1, closed.
+
+        Raises:
+            RobotFaultError: If the gripper does not answer, or has a fault.
+        """
+        if self._fault is not None:
+            raise self._fault
+        return min(max((self._position - self._open) / (self._closed - self._open), 0.0), 1.0)
+
+    def move_to(self, closure: float) -> None:
+        """Sets the target.
+
+        Args:
+            closure (`float`):
+                From 0, open, to 1, closed.
+
+        Raises:
+            RobotFaultError: If the gripper does not answer, or has a fault.
+        """
+        if self._fault is not None:
+            raise self._fault
+        self._target = round(self._open + closure * (self._closed - self._open))
+
+    def _follow(self) -> None:
+        sent = None
+        while not self._stop.wait(POLL_SECONDS):
+            try:
+                if (target := self._target) != sent and target is not None:
+                    self._set(POS=target)
+                    sent = target
+                self._position = self._get("POS")
+                self._check_fault()
+            except RobotFaultError as fault:
+                self._fault = fault
+                return
+            except (OSError, ValueError) as error:
+                if not self._stop.is_set():
+                    self._fault = RobotFaultError(Fault.GRIPPER_SILENT, f"the gripper does not answer ({error})")
+                return
+
+    def _activate(self) -> None:
+        logger.warning("The gripper is being activated: it opens and closes once.")
+        self._set(ACT=0)
+        self._set(ACT=1, GTO=1)
+        deadline = time.monotonic() + ACTIVATION_SECONDS
+        while self._get("STA") != ACTIVE:
+            if time.monotonic() > deadline:
+                raise RobotFaultError(Fault.GRIPPER_FAULT, f"not active {ACTIVATION_SECONDS:.0f} s after activation")
+            time.sleep(POLL_SECONDS)
+
+    def _check_fault(self) -> None:
+        # Below 8 it only says that a move waits for activation.
+        if (fault := self._get("FLT")) >= 8:
+            raise RobotFaultError(Fault.GRIPPER_FAULT, f"the gripper reports fault {fault}")
+
+    def _get(self, name: str) -> int:
+        answer = self._ask(f"GET {name}")
+        kind, _, value = answer.partition(" ")
+        if kind != name or not value.strip().isdigit():
+            raise ValueError(f"it answered {answer!r} to GET {name}")
+        return int(value)
+
+    def _set(self, **values: int) -> None:
+        command = " ".join(f"{name} {value}" for name, value in values.items())
+        if (answer := self._ask(f"SET {command}")) != "ack":
+            raise ValueError(f"it answered {answer!r} to SET {command}")
+
+    def _ask(self, command: str) -> str:
+        if self._socket is None:
+            raise ConnectionError("not connected")
+        self._socket.sendall(f"{command}\n".encode())
+        deadline = time.monotonic() + TIMEOUT
+        # A real URCap answers without a line end, so an answer is what comes in one piece.
+        data = self._socket.recv(1024)
+        if not data or time.monotonic() > deadline:
+            raise ConnectionError("it closed the connection")
+        return data.decode(errors="replace").strip()

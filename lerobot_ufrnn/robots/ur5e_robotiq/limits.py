@@ -1,0 +1,112 @@
+"""What may be sent to the arm: every target passes through here first."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .configuration_ur5e_robotiq import JOINTS, UR5eRobotiqConfig
+
+# Nominal kinematics of the UR5e as its maker publishes them (modified by a few 0.1 mm on each real arm).
+LINK_OFFSETS = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
+LINK_LENGTHS = (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0)
+LINK_TWISTS = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+
+HALVINGS = 6
+"""How often a step that would leave the workspace is halved before it is not made at all."""
+
+
+def flange_position(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Position of the flange from the Denavit-Hartenberg parameters.
+
+    Args:
+        joints (`NDArray[np.float64]`):
+            Joint angles in rad, (6,).
+
+    Returns:
+        `NDArray[np.float64]`: position in m in the frame of the arm's base, (3,).
+    """
+    pose = np.eye(4)
+    for angle, offset, length, twist in zip(joints, LINK_OFFSETS, LINK_LENGTHS, LINK_TWISTS, strict=True):
+        cos, sin, cos_twist, sin_twist = np.cos(angle), np.sin(angle), np.cos(twist), np.sin(twist)
+        pose = pose @ np.array(
+            [
+                [cos, -sin * cos_twist, sin * sin_twist, length * cos],
+                [sin, cos * cos_twist, -cos * sin_twist, length * sin],
+                [0.0, sin_twist, cos_twist, offset],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+    return pose[:3, 3]
+
+
+class Limits:
+    """Turns what is asked for into what may be sent.
+
+    A target is limited, in this order, to the joint ranges, to the joint speed, to a distance from the measured joints
+    and to the workspace. What is no target at all (a wrong number of values, a value that is not finite) is refused.
+
+    Args:
+        config (`UR5eRobotiqConfig`):
+            The limits.
+    """
+
+    def __init__(self, config: UR5eRobotiqConfig):
+        self._low, self._high = np.array(config.joint_low), np.array(config.joint_high)
+        self._max_change = config.joint_speed * config.control_period
+        self._command_limit = config.command_limit
+        self._box_low, self._box_high = np.array(config.workspace_low), np.array(config.workspace_high)
+
+    def check(self, action: dict[str, float]) -> tuple[NDArray[np.float64], float]:
+        """Reads an action and refuses what is none.
+
+        Args:
+            action (`dict[str, float]`):
+                `<joint>.pos` of every joint in rad and `gripper.pos`.
+
+        Returns:
+            `tuple[NDArray[np.float64], float]`: joint targets (6,), and the gripper's from 0 to 1.
+
+        Raises:
+            ValueError: If a value is missing, unknown or not finite.
+        """
+        names = [f"{joint}.pos" for joint in (*JOINTS, "gripper")]
+        if set(action) != set(names):
+            raise ValueError(
+                f"An action must have exactly {names}, got {sorted(action)}; nothing was sent, the arm holds its pose."
+            )
+        values = np.array([float(action[name]) for name in names])
+        if not np.isfinite(values).all():
+            wrong = {name: float(action[name]) for name in names if not np.isfinite(float(action[name]))}
+            raise ValueError(f"An action must be finite, got {wrong}; nothing was sent, the arm holds its pose.")
+        return values[:-1], float(np.clip(values[-1], 0.0, 1.0))
+
+    def limit(
+        self, target: NDArray[np.float64], commanded: NDArray[np.float64], measured: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The target that may be sent.
+
+        Args:
+            target (`NDArray[np.float64]`):
+                Joint angles that are asked for, in rad, (6,).
+            commanded (`NDArray[np.float64]`):
+                Those that were last sent, (6,).
+            measured (`NDArray[np.float64]`):
+                Those that the arm has, (6,).
+
+        Returns:
+            `NDArray[np.float64]`: joint angles, (6,).
+        """
+        target = np.clip(target, self._low, self._high)
+        target = np.clip(target, commanded - self._max_change, commanded + self._max_change)
+        target = np.clip(target, measured - self._command_limit, measured + self._command_limit)
+        share = 1.0
+        for _ in range(HALVINGS):
+            shortened = commanded + share * (target - commanded)
+            if self._outside(shortened) <= self._outside(commanded):
+                return shortened
+            share /= 2
+        return commanded.copy()
+
+    def _outside(self, joints: NDArray[np.float64]) -> float:
+        """How far in m the flange is outside the workspace; 0 inside."""
+        position = flange_position(joints)
+        return float(np.maximum(self._box_low - position, position - self._box_high).clip(min=0).max())

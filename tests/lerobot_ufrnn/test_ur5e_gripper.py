@@ -1,0 +1,186 @@
+"""The gripper's side of the socket, played by a thread that does what the test says."""
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from lerobot_ufrnn.robots.ur5e_robotiq import Fault, RobotFaultError, UR5eRobotiqConfig
+from lerobot_ufrnn.robots.ur5e_robotiq import gripper as gripper_module
+from lerobot_ufrnn.robots.ur5e_robotiq.gripper import Gripper
+
+
+class FakeGripper:
+    """Answers as the URCap does; moves at once."""
+
+    def __init__(self, status: int = 3):
+        self.values = {"STA": status, "FLT": 0, "POS": 3, "ACT": int(status == 3), "GTO": 0, "SPE": 0, "FOR": 0}
+        self.commands: list[str] = []
+        self.is_silent = False
+        self.answer: str | None = None
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                connection, _ = self._listener.accept()
+                while data := connection.recv(1024):
+                    for line in data.decode().splitlines():
+                        if not self.is_silent:
+                            connection.sendall((self.answer or self._reply(line)).encode())
+
+    def _reply(self, line: str) -> str:
+        self.commands.append(line)
+        verb, *words = line.split()
+        if verb == "GET":
+            return f"{words[0]} {self.values[words[0]]}"
+        for name, value in zip(words[::2], words[1::2], strict=True):
+            self.values[name] = int(value)
+        if self.values["ACT"] == 1 and "ACT" in words:
+            self.values["STA"] = 3
+        return "ack"
+
+    def close(self) -> None:
+        self._listener.close()
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    monkeypatch.setattr(gripper_module, "TIMEOUT", 0.3)
+    fakes = []
+
+    def make(**settings) -> FakeGripper:
+        fakes.append(FakeGripper(**settings))
+        return fakes[-1]
+
+    yield make
+    for each in fakes:
+        each.close()
+
+
+@pytest.fixture
+def connected(fake):
+    grippers = []
+
+    def connect(server: FakeGripper, **settings) -> Gripper:
+        config = UR5eRobotiqConfig(ip="127.0.0.1", gripper_port=server.port, **settings)
+        grippers.append(Gripper(config))
+        grippers[-1].connect()
+        return grippers[-1]
+
+    yield connect
+    for each in grippers:
+        each.disconnect()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 5
+    while not condition():
+        assert time.monotonic() < deadline, "never happened"
+        time.sleep(0.01)
+
+
+def raises_soon(gripper: Gripper) -> RobotFaultError:
+    found = []
+
+    def failed() -> bool:
+        try:
+            gripper.closure  # noqa: B018
+        except RobotFaultError as error:
+            found.append(error)
+        return bool(found)
+
+    wait_for(failed)
+    return found[0]
+
+
+def test_an_active_gripper_is_not_moved_by_connecting(fake, connected):
+    server = fake()
+    gripper = connected(server, gripper_force=0.2, gripper_speed=1.0)
+    assert gripper.closure == 0
+    assert "SET GTO 1 SPE 255 FOR 51" in server.commands
+    assert not any("ACT" in command for command in server.commands)
+    time.sleep(0.15)
+    assert not any(command.startswith("SET POS") for command in server.commands)
+
+
+def test_a_gripper_that_is_not_active_is_activated_first(fake, connected):
+    server = fake(status=0)
+    connected(server)
+    assert server.commands.index("SET ACT 1 GTO 1") < server.commands.index("SET GTO 1 SPE 255 FOR 51")
+
+
+@pytest.mark.parametrize(("closure", "position"), [(0.0, 3), (0.5, 116), (1.0, 230)])
+def test_targets_and_readings_share_one_scale(fake, connected, closure, position):
+    server = fake()
+    server.values["POS"] = 99
+    gripper = connected(server)
+    gripper.move_to(closure)
+    wait_for(lambda: server.values["POS"] == position)
+    wait_for(lambda: gripper.closure == pytest.approx(closure, abs=0.005))
+    sent = [command for command in server.commands if command.startswith("SET POS")]
+    assert sent == [f"SET POS {position}"]  # once, not at every poll
+
+
+def test_a_reading_beyond_the_range_is_open_or_closed(fake, connected):
+    server = fake()
+    gripper = connected(server)
+    server.values["POS"] = 255
+    wait_for(lambda: gripper.closure == 1.0)
+    server.values["POS"] = 0
+    wait_for(lambda: gripper.closure == 0.0)
+
+
+def test_where_nobody_listens_there_is_no_gripper():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with pytest.raises(RobotFaultError, match="does not answer") as error:
+        Gripper(UR5eRobotiqConfig(ip="127.0.0.1", gripper_port=port)).connect()
+    assert error.value.fault is Fault.GRIPPER_SILENT
+
+
+@pytest.mark.parametrize(
+    ("breaks", "fault", "message"),
+    [
+        (lambda server: setattr(server, "is_silent", True), Fault.GRIPPER_SILENT, "does not answer"),
+        (lambda server: server.values.update(FLT=11), Fault.GRIPPER_FAULT, "reports fault 11"),
+        (lambda server: setattr(server, "answer", "?\x00%"), Fault.GRIPPER_SILENT, "does not answer .*it answered"),
+    ],
+)
+@pytest.mark.parametrize("before", [True, False])
+def test_what_breaks_before_or_while_connected_is_told(fake, connected, breaks, fault, message, before):
+    server = fake()
+    if before:
+        breaks(server)
+        with pytest.raises(RobotFaultError, match=message) as error:
+            connected(server)
+        assert error.value.fault is fault
+        return
+    gripper = connected(server)
+    breaks(server)
+    told = raises_soon(gripper)
+    assert told.fault is fault
+    with pytest.raises(RobotFaultError, match=message):
+        gripper.move_to(0.5)
+
+
+def test_a_lesser_fault_only_says_that_it_is_not_ready(fake, connected):
+    server = fake()
+    server.values["FLT"] = 5
+    assert connected(server).closure == 0
+
+
+def test_disconnecting_neither_opens_nor_closes(fake, connected):
+    server = fake()
+    gripper = connected(server)
+    gripper.move_to(0.7)
+    wait_for(lambda: server.values["POS"] > 100)
+    before = len([command for command in server.commands if command.startswith("SET")])
+    gripper.disconnect()
+    gripper.disconnect()
+    assert len([command for command in server.commands if command.startswith("SET")]) == before
