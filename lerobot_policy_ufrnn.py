@@ -1,11 +1,13 @@
-"""LeRobot's discovery hook: importing this module registers the policy type `ufrnn` and the environment type `door`."""
+"""LeRobot's discovery hook: importing this module registers our policy, environment, robot and teleoperators."""
 
 import logging
 
 from env_door.configuration_door import DoorEnvConfig
 from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
+from lerobot_ufrnn.robots.ur5e_robotiq import UR5eRobotiqConfig
+from lerobot_ufrnn.teleoperators import KeyboardTwistConfig, SpaceMouseTwistConfig
 
-__all__ = ["DoorEnvConfig", "UFRNNConfig"]
+__all__ = ["DoorEnvConfig", "KeyboardTwistConfig", "SpaceMouseTwistConfig", "UFRNNConfig", "UR5eRobotiqConfig"]
 
 
 def _keep_last_line(record: logging.LogRecord) -> bool:

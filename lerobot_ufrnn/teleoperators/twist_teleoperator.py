@@ -1,0 +1,250 @@
+"""LeRobot's teleoperators that move the tool of a UR5e and command its joints."""
+
+import contextlib
+import logging
+from abc import abstractmethod
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from lerobot.lerobot_types import RobotAction
+from lerobot.teleoperators import Teleoperator
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
+from numpy.typing import NDArray
+
+from lerobot_ufrnn.robots.ur5e_robotiq.configuration_ur5e_robotiq import JOINTS
+
+from .arm_state import ArmState
+from .configuration_twist import KeyboardTwistConfig, SpaceMouseTwistConfig, TwistTeleoperatorConfig
+from .device import CLOSE, OPEN, DeviceState, TwistDevice
+from .event_stream import EventRecorder, EventStreamDevice
+from .key_sources import make_key_source
+from .keyboard_device import KeyboardDevice
+from .notices import Notices
+from .spacemouse_device import SpaceMouseDevice
+from .tool_target import ToolTarget
+
+logger = logging.getLogger(__name__)
+
+MAX_STEP_SECONDS = 0.25
+"""Longest time that one action moves the target for; a loop that hangs does not make it leap."""
+
+PAUSE_SECONDS = 1.0
+"""Time without an action after which the target starts from where the arm is, as it did at first."""
+
+TOOL_FROM_OPERATOR = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+"""Ahead, left and up in the tool's own axes: z points ahead, and with the gripper level x points up."""
+
+
+class TwistTeleoperator(Teleoperator):
+    """Turns the twist of an input device into joint targets, in the features of the robot.
+
+    What LeRobot calls the action has the robot's own names, `<joint>.pos` in rad and `gripper.pos` from 0, open, to
+    1, closed. So the stock `lerobot-teleoperate` and `lerobot-record` need no processors, and what they record is
+    what a policy of the simulated door is trained on.
+
+    **Where it starts.** The stock loops call `get_action()` without saying where the arm is, and call `send_feedback`
+    for one humanoid only; they connect the teleoperator before the robot. A pose from the configuration would be a
+    guess, and a wrong guess a jump. So the teleoperator asks the arm's controller itself, through a connection of its
+    own that can only read, and it does so when the *first action* is asked for, when the robot is connected and
+    at rest. That first action is the measured pose itself, whatever the device says, with the gripper's target in
+    force. The connection stays open: every later target lies within `max_lead` of the joints measured at that moment,
+    so that there cannot be a jump later either, be the arm blocked or moved by somebody else. After a pause of more
+    than a second, such as LeRobot makes to save an episode, it starts anew from where the arm is.
+
+    **When something is wrong.** A device that is silent or gives nonsense counts as at rest: the arm holds. A device
+    that is gone, or an arm whose place is not known any more, ends `get_action()` with an error that says what to do;
+    the stock commands then disconnect, and the robot stops the arm. Out of reach or near a singular pose, the target
+    stays where it is. The operator is told once, not at every step.
+
+    Collisions of the arm are not looked for. Episodes are controlled with LeRobot's own keys (right arrow or n: next,
+    left arrow or r: again, Escape or q: stop).
+
+    Args:
+        config (`TwistTeleoperatorConfig`):
+            Address, frame, speeds and limits.
+    """
+
+    config_class = TwistTeleoperatorConfig
+    name = "twist"
+
+    def __init__(self, config: TwistTeleoperatorConfig):
+        super().__init__(config)
+        self.config = config
+        self.clock = monotonic
+        self._scale = np.array([config.linear_speed] * 3 + [config.angular_speed] * 3)
+        self._notices = Notices(logger)
+        self._arm: ArmState | None = None
+        self._device: TwistDevice | None = None
+        self._target: ToolTarget | None = None
+        self._gripper = 0.0
+        self._last: float | None = None
+
+    @abstractmethod
+    def make_own_device(self) -> TwistDevice:
+        """The input device of this type.
+
+        Returns:
+            `TwistDevice`: not opened yet.
+        """
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        """`dict[str, type]`: the robot's."""
+        return {f"{joint}.pos": float for joint in (*JOINTS, "gripper")}
+
+    @property
+    def feedback_features(self) -> dict[str, type]:
+        """`dict[str, type]`: none; the device cannot be moved, and the arm is asked for its state directly."""
+        return {}
+
+    @property
+    def is_connected(self) -> bool:
+        """`bool`: whether `connect` was called and `disconnect` was not."""
+        return self._device is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """`bool`: always; there is nothing to calibrate."""
+        return True
+
+    def calibrate(self) -> None:
+        """Nothing to do."""
+
+    def configure(self) -> None:
+        """Nothing to do."""
+
+    @check_if_already_connected
+    def connect(self, calibrate: bool = True) -> None:
+        """Opens the device and the connection to the arm's controller; nothing moves.
+
+        Args:
+            calibrate (`bool`, *optional*, defaults to `True`):
+                Of no effect.
+
+        Raises:
+            DeviceUnavailableError: If the device cannot be used.
+            ArmStateError: If the controller cannot be reached.
+            ImportError: If a library is missing.
+        """
+        config = self.config
+        arm = ArmState(config.robot_ip, config.gripper_port, config.gripper_range, self.clock)
+        device = self._make_device()
+        arm.open()
+        try:
+            device.open()
+        except BaseException:
+            arm.close()
+            raise
+        self._target = ToolTarget(config.joint_speed, config.max_lead, config.min_manipulability)
+        self._arm, self._device, self._last = arm, device, None
+
+    @check_if_not_connected
+    def get_action(self) -> RobotAction:
+        """Joint targets for now.
+
+        Returns:
+            `RobotAction`: `<joint>.pos` in rad and `gripper.pos`; the first one is where the arm is.
+
+        Raises:
+            DeviceLostError: If the device is gone.
+            ArmStateError: If it is not known where the arm is.
+            ValueError: If the arm starts beyond its joint ranges.
+        """
+        assert self._arm is not None
+        assert self._target is not None
+        now = self.clock()
+        measured = self._arm.joints()
+        state = self._read_device()
+        if self._last is None or now - self._last > PAUSE_SECONDS:
+            joints = self._target.start(measured)
+            self._gripper = self._arm.gripper_target()
+            # Asking the gripper takes a moment, which is not to count as a step of the next action.
+            now = self.clock()
+        else:
+            seconds = min(now - self._last, MAX_STEP_SECONDS)
+            joints = self._target.step(self._in_base(state.twist * self._scale), seconds, measured)
+            if self._target.hindrance is not None:
+                self._notices.tell(self._target.hindrance.value, now)
+            closing = (CLOSE in state.buttons) - (OPEN in state.buttons)
+            self._gripper = float(np.clip(self._gripper + closing * self.config.gripper_speed * seconds, 0.0, 1.0))
+        self._last = now
+        values = (*joints.tolist(), self._gripper)
+        return dict(zip(self.action_features, values, strict=True))
+
+    def send_feedback(self, feedback: dict[str, Any]) -> None:
+        """Nothing to do: the stock loops call this for other robots only, so nothing may depend on it.
+
+        Args:
+            feedback (`dict[str, Any]`):
+                Ignored.
+        """
+
+    @check_if_not_connected
+    def disconnect(self) -> None:
+        """Lets go of the device and the connection. Does not fail once connected: the robot is next to be stopped."""
+        device, arm = self._device, self._arm
+        self._device = self._arm = None
+        for part in (device, arm):
+            if part is not None:
+                with contextlib.suppress(Exception):
+                    part.close()
+
+    def _make_device(self) -> TwistDevice:
+        config = self.config
+        device = self.make_own_device() if config.device is None else EventStreamDevice(config.device, self.clock)
+        return device if config.record_events is None else EventRecorder(device, config.record_events, self.clock)
+
+    def _read_device(self) -> DeviceState:
+        assert self._device is not None
+        state = self._device.read()
+        if (fault := state.fault()) is not None:
+            self._notices.tell(f"The arm holds: {fault}.", self.clock(), kind="fault")
+            return DeviceState()
+        return DeviceState(np.clip(state.twist, -1.0, 1.0), state.buttons)
+
+    def _in_base(self, twist: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self.config.frame == "base":
+            return twist
+        assert self._target is not None
+        return (self._target.rotation @ TOOL_FROM_OPERATOR @ twist.reshape(2, 3).T).T.ravel()
+
+
+class SpaceMouseTwist(TwistTeleoperator):
+    """`--teleop.type=spacemouse_twist`.
+
+    Args:
+        config (`SpaceMouseTwistConfig`):
+            See there.
+    """
+
+    config_class = SpaceMouseTwistConfig
+    name = "spacemouse_twist"
+
+    def __init__(self, config: SpaceMouseTwistConfig):
+        super().__init__(config)
+        self._deadzone, self._stale_after = config.deadzone, config.stale_after
+
+    def make_own_device(self) -> TwistDevice:
+        """The SpaceMouse."""
+        return SpaceMouseDevice(self._deadzone, self._stale_after)
+
+
+class KeyboardTwist(TwistTeleoperator):
+    """`--teleop.type=keyboard_twist`.
+
+    Args:
+        config (`KeyboardTwistConfig`):
+            See there.
+    """
+
+    config_class = KeyboardTwistConfig
+    name = "keyboard_twist"
+
+    def __init__(self, config: KeyboardTwistConfig):
+        super().__init__(config)
+        self._keys, self._key_hold = config.keys, config.key_hold
+
+    def make_own_device(self) -> TwistDevice:
+        """The keyboard."""
+        return KeyboardDevice(make_key_source(self._keys, self._key_hold))
