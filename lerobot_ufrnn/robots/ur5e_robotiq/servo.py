@@ -262,6 +262,7 @@ def _servo(
         # A blocked arm must not be leant against harder than agreed, however far it is pushed back between targets.
         commanded = np.clip(wanted, measured - config.command_limit, measured + config.command_limit)
         if not control.servoJ(commanded.tolist(), 0.0, 0.0, period, config.servo_lookahead, config.servo_gain):
+            time.sleep(0.1)  # so that the reason has come
             _check(config, owner, control, receive, now, stamped)
             raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
         # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
@@ -286,12 +287,19 @@ def _check(config: UR5eRobotiqConfig, owner: int, control: Any, receive: Any, no
         raise _StopError(Fault.LINK_LOST, f"the connection to {config.ip} broke")
     if now - stamped > config.stale_after:
         raise _StopError(Fault.STALE_DATA, f"no new data from {config.ip} for {1000 * (now - stamped):.0f} ms")
+    _check_safety(receive)
+    if not control.isProgramRunning():
+        # A stop for safety ends the program, too, but is told on another connection, perhaps a little later.
+        time.sleep(0.1)
+        _check_safety(receive)
+        raise _StopError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
+    if os.getppid() != owner:
+        raise _StopError(Fault.OWNER_GONE, "the program that commanded it ended")
+
+
+def _check_safety(receive: Any) -> None:
     safety = receive.getSafetyMode()
     if safety not in (SAFETY_NORMAL, SAFETY_REDUCED):
         raise _StopError(STOPPED_BY_SAFETY.get(safety, Fault.PROTECTIVE_STOP), f"safety mode {safety}")
     if (mode := receive.getRobotMode()) != ROBOT_MODE_RUNNING:
         raise _StopError(Fault.NOT_RUNNING, f"robot mode {mode} instead of {ROBOT_MODE_RUNNING} (running)")
-    if not control.isProgramRunning():
-        raise _StopError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
-    if os.getppid() != owner:
-        raise _StopError(Fault.OWNER_GONE, "the program that commanded it ended")
