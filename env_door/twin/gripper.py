@@ -1,11 +1,14 @@
 """A Robotiq 2F-85: its variables, what they do to the fingers, and the socket of its URCap on port 63352.
 
 The fingers go at the speed that was set towards the position that was asked for, stop at what is in between and keep
-squeezing with the force that was set. Position 0 is open and 255 closed, exactly: a real gripper reads some 3 to 230.
+squeezing with the force that was set. It reads 3 when it is open and 230 when it is closed, as a real one does roughly.
 """
 
 from env_door.twin.lines import LinePeer
 from env_door.twin.network import Connection
+
+OPEN, CLOSED = 3, 230
+"""Positions, of 0 to 255, at the ends of the stroke; what is asked for beyond them leads to the end."""
 
 STROKE_SPEEDS = (0.235, 1.765)
 """Slowest and fastest closing in strokes per second (20 and 150 mm/s of 85 mm)."""
@@ -30,6 +33,11 @@ MAJOR_FAULT = 10
 
 RESET, ACTIVATING, ACTIVE = 0, 1, 3
 MOVING, BLOCKED_OPENING, BLOCKED_CLOSING, AT_TARGET = 0, 1, 2, 3
+
+
+def closure_at(position: int) -> float:
+    """Closure, 0 open to 1 closed, at a position of 0 to 255."""
+    return min(max((position - OPEN) / (CLOSED - OPEN), 0.0), 1.0)
 
 
 class Gripper:
@@ -102,7 +110,7 @@ class Gripper:
             if self._activating <= 0:
                 self._status, self._fault = ACTIVE, self.cause
         elif self._status == ACTIVE and self._set["GTO"] and self._fault < MAJOR_FAULT:
-            self._approach(self._set["POS"] / 255, seconds)
+            self._approach(closure_at(self._set["POS"]), seconds)
         self._still = self._still + seconds if moved < 0.02 * seconds else 0.0
         self._object = self._detect(closure)
 
@@ -112,7 +120,7 @@ class Gripper:
         self.target += min(max(goal - self.target, -step), step)
 
     def _detect(self, closure: float) -> int:
-        goal = self._set["POS"] / 255
+        goal = closure_at(self._set["POS"])
         if self._still < BLOCKED_SECONDS or not self._set["GTO"]:
             return MOVING
         if abs(goal - closure) <= 3 / 255:
@@ -138,7 +146,7 @@ class Gripper:
             "STA": self._status,
             "OBJ": self._object,
             "FLT": self._fault,
-            "POS": round(min(max(self._measured, 0.0), 1.0) * 255),
+            "POS": round(OPEN + min(max(self._measured, 0.0), 1.0) * (CLOSED - OPEN)),
             "PRE": self._set["POS"],
         }
         return str((self._set | status).get(name, "?"))

@@ -336,7 +336,7 @@ def test_gripper_closes_and_opens(twin):
         until(lambda: ask("GET STA") == "STA 3")
         assert ask("SET GTO 1 SPE 255 FOR 200 POS 255") == "ack"
         until(lambda: ask("GET OBJ") == "OBJ 3")
-        assert ask("GET POS") == "POS 255"
+        assert ask("GET POS") == "POS 230"
         assert twin.state()["joints"]["gripper"] == pytest.approx(1.0, abs=0.01)
         assert ask("SET POS 0") == "ack"
         until(lambda: ask("GET POS") == "POS 0")
@@ -393,7 +393,7 @@ def test_what_opens_the_door_in_the_environment_opens_it_through_the_client(twin
         time.sleep(1.2)
         target = actions[0][:6]
         for action in actions:
-            gripper.sendall(f"SET POS {round(float(action[6]) * 255)}\n".encode())
+            gripper.sendall(f"SET POS {round(3 + 227 * float(action[6]))}\n".encode())
             start, target = target, action[:6]
             for part in np.arange(1, 13) / 12:
                 period = control.initPeriod()

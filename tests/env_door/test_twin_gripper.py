@@ -64,13 +64,13 @@ def test_closing_takes_the_time_of_the_real_gripper(active, speed, seconds):
     assert active.get("OBJ") == "0"
     assert fingers.closure < 1.0
     fingers.run(0.05 * seconds + 0.1)
-    assert (active.get("POS"), active.get("OBJ"), active.get("PRE")) == ("255", "3", "255")
+    assert (active.get("POS"), active.get("OBJ"), active.get("PRE")) == ("230", "3", "255")
 
 
 def test_an_object_is_detected_and_squeezed(active):
     active.set({"GTO": 1, "SPE": 255, "FOR": 255, "POS": 255})
     Fingers(active, object_at=0.6).run(1.0)
-    assert (active.get("OBJ"), active.get("POS")) == ("2", str(round(0.6 * 255)))
+    assert (active.get("OBJ"), active.get("POS")) == ("2", str(round(3 + 0.6 * 227)))
     assert active.target == pytest.approx(1.0)
 
 
@@ -105,7 +105,7 @@ def test_without_power_it_answers_with_question_marks_and_forgets_its_activation
 @pytest.mark.parametrize(
     ("request_line", "answer"),
     [
-        ("GET POS", b"POS 0\n"),
+        ("GET POS", b"POS 3\n"),
         ("GET STA", b"STA 3\n"),
         ("SET POS 200 SPE 255 FOR 1 GTO 1", b"ack"),
         ("SET POS 256", b"?\n"),
@@ -127,7 +127,7 @@ def test_socket_takes_split_and_joined_lines(active):
     socket.received(b"GET P")
     assert line.sent == b""
     socket.received(b"OS\nGET STA\n")
-    assert line.sent == b"POS 0\nSTA 3\n"
+    assert line.sent == b"POS 3\nSTA 3\n"
 
 
 def test_silence_and_garbage(active):

@@ -29,7 +29,7 @@ def connected(twin):
     robots = []
 
     def connect(**settings) -> UR5eRobotiq:
-        settings = {"image_size": 0, "gripper_range": (0, 255), **settings}
+        settings = {"image_size": 0, **settings}
         robots.append(UR5eRobotiq(UR5eRobotiqConfig(ip=twin.address, id="test", **settings)))
         robots[-1].connect()
         return robots[-1]
