@@ -151,9 +151,10 @@ def futures(results_dir: Path) -> Section:
     """What foresight imagines."""
     section = Section(
         "Imagined futures",
-        "UF-RNN perturbs its hidden state, imagines what each candidate leads to, and goes on with one whose future is "
-        "little uncertain: at every step, or, with recall, when the joints contradict what it predicted, and then with "
-        "none that is like a failed try. The autoencoder's decoder turns imagined features into images.",
+        "UF-RNN imagines what several candidates lead to: at every step those of a perturbed hidden state, of which it "
+        "keeps the one whose future is least uncertain; with recall, when the joints contradict what it predicted, those "
+        "that sense something other than expected, of which it tries the most determined one that is unlike any failed "
+        "try. The autoencoder's decoder turns imagined features into images.",
     )
     _add_picture(
         section,
