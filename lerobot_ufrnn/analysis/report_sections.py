@@ -152,9 +152,9 @@ def futures(results_dir: Path) -> Section:
     section = Section(
         "Imagined futures",
         "UF-RNN imagines what several candidates lead to: at every step those of a perturbed hidden state, of which it "
-        "keeps the one whose future is least uncertain; with recall, when the joints contradict what it predicted, those "
-        "that sense something other than expected, of which it tries the most determined one that is unlike any failed "
-        "try. The autoencoder's decoder turns imagined features into images.",
+        "keeps the one whose future is least uncertain; with recall, when the joints contradict what it predicted, "
+        "those that sense something other than expected, of which it tries the most determined one that is unlike any "
+        "failed try. The autoencoder's decoder turns imagined features into images.",
     )
     _add_picture(
         section,
