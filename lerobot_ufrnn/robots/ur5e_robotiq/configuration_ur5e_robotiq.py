@@ -46,10 +46,12 @@ class UR5eRobotiqConfig(RobotConfig):
         workspace_low (`tuple[float, float, float]`, *optional*), workspace_high (*optional*):
             Corners in m, in the frame of the arm's base, of the box that the flange may be in. A target outside it is
             shortened so that the flange stays inside.
-        stale_after (`float`, *optional*, defaults to `0.1`):
-            Seconds without new data from the controller after which the arm is stopped.
-        watchdog_frequency (`float`, *optional*, defaults to `10.0`):
-            Commands a second below which the controller stops the arm on its own, whatever became of this computer.
+        stale_after (`float`, *optional*, defaults to `0.2`):
+            Seconds without new data from the controller, or by which a set-point is late, from which the arm is
+            stopped.
+        watchdog_frequency (`float`, *optional*, defaults to `4.0`):
+            Commands a second below which the controller stops the arm on its own, whatever became of this computer;
+            until then the arm goes no further than to the last set-point.
         gripper_port (`int`, *optional*, defaults to `63352`):
             Port of the gripper's socket on the controller; 0 if there is no gripper, which then reads as open.
         gripper_force (`float`, *optional*, defaults to `0.2`):
@@ -76,8 +78,8 @@ class UR5eRobotiqConfig(RobotConfig):
     joint_high: tuple[float, ...] = (JOINT_RANGE, JOINT_RANGE, ELBOW_RANGE, *(JOINT_RANGE,) * 3)
     workspace_low: tuple[float, float, float] = (-0.95, -0.95, 0.05)
     workspace_high: tuple[float, float, float] = (0.95, 0.95, 1.1)
-    stale_after: float = 0.1
-    watchdog_frequency: float = 10.0
+    stale_after: float = 0.2
+    watchdog_frequency: float = 4.0
     gripper_port: int = 63352
     gripper_force: float = 0.2
     gripper_speed: float = 1.0

@@ -26,9 +26,6 @@ START_SECONDS = 20.0
 STOP_DECELERATION = 4.0
 """Deceleration in rad/s^2 with which the arm is stopped."""
 
-LATE_PERIODS = 12
-"""Servo periods (0.1 s) by which a set-point may come late before the arm is stopped."""
-
 ROBOT_MODE_RUNNING = 7
 SAFETY_NORMAL, SAFETY_REDUCED = 1, 2
 STOPPED_BY_SAFETY = {3: Fault.PROTECTIVE_STOP, 6: Fault.EMERGENCY_STOP, 7: Fault.EMERGENCY_STOP}
@@ -274,7 +271,7 @@ def _servo(
         due += period
         if (behind := time.monotonic() - due) > 0:
             late += behind > period
-            if behind > LATE_PERIODS * period:
+            if behind > config.stale_after:
                 raise _StopError(Fault.SERVO_LATE, f"a set-point came {1000 * behind:.0f} ms late")
             due = time.monotonic()
         else:
