@@ -127,12 +127,24 @@ class TrialLog(gym.Wrapper):
             held_at=self._held_at,
             tried_while_held=tuple(info["tried_while_held"]),
         )
-        line = json.dumps(asdict(trial)) + "\n"
-        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        try:
-            os.write(descriptor, line.encode())
-        finally:
-            os.close(descriptor)
+        append_trial(self._path, trial)
+
+
+def append_trial(path: str | Path, trial: Trial) -> None:
+    """Add a trial to a log, in a single write.
+
+    Args:
+        path (`str | Path`):
+            File to append to.
+        trial (`Trial`):
+            The trial.
+    """
+    line = json.dumps(asdict(trial)) + "\n"
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    try:
+        os.write(descriptor, line.encode())
+    finally:
+        os.close(descriptor)
 
 
 def read_trials(path: str | Path) -> list[Trial]:

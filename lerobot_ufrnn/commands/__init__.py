@@ -16,6 +16,7 @@ COMMANDS = {
     "hidden": "draw hidden states along the demonstrations and in a trial, model by model",
     "drift": "measure how far imagined futures drift from the demonstrations",
     "lyapunov": "draw how chaotic the imagined futures are along the demonstrations",
+    "rehearse": "run trials on the digital twin of the robot, through stock lerobot-rollout",
     "report": "put all results, tables, pictures and videos into one page",
     "benchmark": "time it against the readable code, XLA, ACT and Diffusion Policy",
 }

@@ -1,0 +1,184 @@
+"""`ufrnn rehearse`: door trials of a policy on the digital twin, through stock `lerobot-rollout`."""
+
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from env_door.env import MAX_HOLD
+from env_door.latch import KINDS
+from env_door.trials import Trial, append_trial, read_trials
+from env_door.twin import TwinProcess, ports
+
+from ..analysis.results import summarize, to_markdown
+from ..experiments.processes import with_this_python
+from .flags import parse_flags
+
+FPS = 10
+START_SECONDS = 120.0
+"""Longest time for a roll-out to load its policy and connect."""
+
+END_SECONDS = 30.0
+POLL_SECONDS = 0.05
+SLOW = "running slower"
+"""What `lerobot-rollout` warns of when a tick was late."""
+
+
+@dataclass
+class RehearseConfig:
+    """Which policy to try, and in which trials.
+
+    Args:
+        policy_path (`str`):
+            Checkpoint folder or Hub repository.
+        trial_log (`Path`):
+            File that gets a JSON line for each trial, as from `lerobot-eval --env.trial_log`. Trials that are in it are
+            not repeated.
+        kinds (`tuple[str, ...]`, *optional*, defaults to `("push", "pull", "slide")`):
+            Kinds of doors.
+        trials_per_kind (`int`, *optional*, defaults to `7`):
+            Trials for each.
+        seed (`int`, *optional*, defaults to `20000`):
+            Seed of the first; the others count up from it.
+        duration (`float`, *optional*, defaults to `30.0`):
+            Longest trial in s.
+        hold_seconds (`float`, *optional*, defaults to `0.0`):
+            Time in s for which somebody holds the door once it has begun to open.
+
+    Raises:
+        ValueError: If a field is out of its range.
+    """
+
+    policy_path: str
+    trial_log: Path
+    kinds: tuple[str, ...] = field(default=KINDS)
+    trials_per_kind: int = 7
+    seed: int = 20000
+    duration: float = 30.0
+    hold_seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.kinds or not set(self.kinds) <= set(KINDS):
+            raise ValueError(f"--kinds must be one or more of {list(KINDS)}, got {list(self.kinds)}.")
+        if self.trials_per_kind < 1 or self.seed < 0:
+            raise ValueError("--trials_per_kind must be at least 1 and --seed at least 0.")
+        if not 0 < self.duration <= 3600:
+            raise ValueError(f"--duration must be above 0 and at most 3600 s, got {self.duration}.")
+        if not 0 <= self.hold_seconds <= MAX_HOLD:
+            raise ValueError(f"--hold_seconds must be 0 to {MAX_HOLD:g} s, got {self.hold_seconds}.")
+
+
+def run(arguments: list[str]) -> None:
+    """Runs the trials that the log does not have, and prints the table of all."""
+    config = parse_flags(RehearseConfig, arguments)
+    config.trial_log.parent.mkdir(parents=True, exist_ok=True)
+    done = {(trial.door_kind, trial.seed) for trial in _logged(config.trial_log)}
+    with TwinProcess(camera=True, hold_seconds=config.hold_seconds) as twin:
+        for kind, seed in _trials(config):
+            if (kind, seed) in done:
+                continue
+            trial, late = _try(config, twin, kind, seed)
+            append_trial(config.trial_log, trial)
+            tried = ", ".join(trial.attempts) or "nothing"
+            outcome = f"opened after {trial.steps / FPS:.1f} s" if trial.success else "not opened"
+            print(f"{kind} door, seed {seed}: {outcome}; tried {tried}; {late} late ticks", flush=True)
+    print("\n" + to_markdown(summarize(_logged(config.trial_log))), end="")
+
+
+def _logged(path: Path) -> list[Trial]:
+    return read_trials(path) if path.exists() else []
+
+
+def _trials(config: RehearseConfig) -> Iterator[tuple[str, int]]:
+    for number in range(config.trials_per_kind):
+        for kind in config.kinds:
+            yield kind, config.seed + number
+
+
+def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tuple[Trial, int]:
+    """One trial, and how many of its ticks were late.
+
+    Raises:
+        RuntimeError: If the roll-out fails; the message has the end of its output.
+    """
+    twin.reset(kind, seed)
+    with tempfile.TemporaryFile() as output:
+        rollout = subprocess.Popen(
+            with_this_python(_rollout(config, twin.address)),
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            trial = _watch(config, twin, rollout, kind, seed)
+        finally:
+            if rollout.poll() is None:
+                rollout.send_signal(signal.SIGINT)  # LeRobot's own way to end a roll-out early
+            try:
+                rollout.wait(END_SECONDS)
+            except subprocess.TimeoutExpired:
+                rollout.kill()
+                rollout.wait()
+        text = _text(output)
+    if trial is None:
+        raise RuntimeError(f"lerobot-rollout ended with status {rollout.returncode} too soon:\n{text[-2000:]}")
+    return trial, text.count(SLOW)
+
+
+def _rollout(config: RehearseConfig, address: str) -> list[str]:
+    camera = f"{{type: zmq, server_address: {address}, port: {ports.CAMERA}, camera_name: front"
+    return [
+        "lerobot-rollout",
+        f"--policy.path={config.policy_path}",
+        "--robot.type=ur5e_robotiq",
+        "--robot.id=twin",
+        f"--robot.ip={address}",
+        f"--robot.cameras={{front: {camera}, width: 640, height: 480, fps: 30}}}}",
+        f"--fps={FPS}",
+        f"--duration={config.duration}",
+        "--task=open the door",
+        "--return_to_initial_position=false",
+    ]
+
+
+def _watch(config: RehearseConfig, twin: TwinProcess, rollout: subprocess.Popen, kind: str, seed: int) -> Trial | None:
+    """Looks on until the door is open or the time is over; `None` if the roll-out ends before it moved the arm."""
+    begin = held_at = None
+    deadline = time.monotonic() + START_SECONDS + config.duration
+    state: dict[str, Any] = {}
+    while time.monotonic() < deadline:
+        state = twin.state()
+        if begin is None and max(abs(state["targets"][name] - value) for name, value in state["joints"].items()) > 0.01:
+            begin = state["time"]
+        if begin is not None:
+            steps = round((state["time"] - begin) * FPS)
+            if state["held"] and held_at is None:
+                held_at = steps
+            if state["is_open"] or steps >= config.duration * FPS or rollout.poll() is not None:
+                break
+        elif rollout.poll() is not None:
+            return None
+        time.sleep(POLL_SECONDS)
+    if begin is None:
+        return None
+    return Trial(
+        seed=seed,
+        door_kind=kind,
+        success=bool(state["is_open"]),
+        steps=steps,
+        attempts=tuple(state["attempts"]),
+        opening=float(state["opening"]),
+        door_offset=0.0,
+        held_at=held_at,
+        tried_while_held=tuple(state["tried_while_held"]),
+    )
+
+
+def _text(output: IO[bytes]) -> str:
+    output.seek(0)
+    return output.read().decode(errors="replace")
