@@ -20,7 +20,7 @@ from .configuration_ur5e_robotiq import UR5eRobotiqConfig
 from .errors import Fault, RobotFaultError
 from .mailbox import Mailbox
 
-START_SECONDS = 20.0
+START_SECONDS = 60.0
 """How long connecting may take; the client uploads a program and waits for it to run."""
 
 STOP_DECELERATION = 4.0
