@@ -144,6 +144,7 @@ def test_without_new_actions_the_arm_rests_where_it_was_sent(twin, connected):
 # ── Faults ────────────────────────────────────────────────────────────
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "parameters", "fault"),
     [
@@ -182,6 +183,7 @@ def test_whatever_fails_stops_the_arm_and_leaves_it_stopped(twin, connected, nam
     assert not robot.is_connected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fault", "message"),
     [

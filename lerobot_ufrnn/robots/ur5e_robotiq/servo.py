@@ -258,7 +258,11 @@ def _servo(
         wanted = begin + (end - begin) * progress
         # A blocked arm must not be leant against harder than agreed, however far it is pushed back between targets.
         commanded = np.clip(wanted, measured - config.command_limit, measured + config.command_limit)
-        if not control.servoJ(commanded.tolist(), 0.0, 0.0, period, config.servo_lookahead, config.servo_gain):
+        try:
+            taken = control.servoJ(commanded.tolist(), 0.0, 0.0, period, config.servo_lookahead, config.servo_gain)
+        except RuntimeError as error:  # the client found the link broken and tried in vain to mend it
+            raise _StopError(Fault.LINK_LOST, str(error)) from error
+        if not taken:
             time.sleep(0.1)  # so that the reason has come
             _check(config, owner, control, receive, now, stamped)
             raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
