@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_ufrnn.robots.ur5e_robotiq.client import import_client
+from lerobot_ufrnn.robots.ur5e_robotiq.gripper import closure_at
+
 from .errors import ArmStateError
 
 RTDE_PORT = 30004
@@ -40,7 +43,7 @@ class ArmState:
     ):
         self._ip = robot_ip
         self._gripper_port = gripper_port
-        self._open_reading, self._closed_reading = gripper_range
+        self._gripper_range = gripper_range
         self._clock = clock
         self._receive: Any = None
         self._stamp: float | None = None
@@ -53,13 +56,7 @@ class ArmState:
             ImportError: If `ur_rtde` is not installed; says how to install it.
             ArmStateError: If the controller cannot be reached.
         """
-        try:
-            import rtde_receive
-        except ImportError as error:
-            raise ImportError(
-                f"Teleoperating the arm needs ur_rtde, which cannot be imported ({error}): "
-                "`pip install 'lerobot_policy_ufrnn[ur5e]'`."
-            ) from error
+        _, rtde_receive, _ = import_client("Teleoperating the arm")
         try:
             # The client's constructor cannot be interrupted; find out in a way that can whether anybody is there.
             socket.create_connection((self._ip, RTDE_PORT), TIMEOUT_SECONDS).close()
@@ -126,8 +123,7 @@ class ArmState:
                 f"The gripper at {self._ip}:{self._gripper_port} cannot be asked for its target ({error}), and a wrong "
                 "one would drop what it holds: check its cable, or say --teleop.gripper_port=0 if there is none."
             ) from error
-        closure = (int(answer[1]) - self._open_reading) / (self._closed_reading - self._open_reading)
-        return min(max(closure, 0.0), 1.0)
+        return closure_at(int(answer[1]), self._gripper_range)
 
     def close(self) -> None:
         """Disconnects. Safe to call at any time."""

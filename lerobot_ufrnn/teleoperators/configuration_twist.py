@@ -6,6 +6,12 @@ from pathlib import Path
 from draccus.utils import ParsingError
 from lerobot.teleoperators import TeleoperatorConfig
 
+from lerobot_ufrnn.robots.ur5e_robotiq.configuration_ur5e_robotiq import (
+    check_address,
+    check_gripper_range,
+    check_range,
+)
+
 FRAMES = ("base", "tool")
 KEY_SOURCES = ("auto", "pynput", "terminal")
 
@@ -62,8 +68,7 @@ class TwistTeleoperatorConfig(TeleoperatorConfig):
     record_events: Path | None = None
 
     def __post_init__(self) -> None:
-        if not self.robot_ip:
-            raise ParsingError("`robot_ip` must be the address of the controller, such as 192.168.1.10, got ''.")
+        check_address(self, "robot_ip")
         self._check_choice("frame", FRAMES)
         for name, low, high in (
             ("linear_speed", 0.001, 0.5),
@@ -74,21 +79,14 @@ class TwistTeleoperatorConfig(TeleoperatorConfig):
             ("gripper_speed", 0.01, 10.0),
             ("gripper_port", 0, 65535),
         ):
-            self._check_range(name, low, high)
-        if len(self.gripper_range) != 2 or not 0 <= self.gripper_range[0] < self.gripper_range[1] <= 255:
-            raise ParsingError(
-                f"`gripper_range` must be two readings, 0 <= open < closed <= 255, got {self.gripper_range}."
-            )
+            check_range(self, name, low, high)
+        check_gripper_range(self.gripper_range)
         if self.device is not None and self.record_events is not None and self.device == self.record_events:
             raise ParsingError(f"`record_events` would overwrite `device`, {self.device}; name another file.")
 
     def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
         if getattr(self, name) not in choices:
             raise ParsingError(f"`{name}` must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
-
-    def _check_range(self, name: str, low: float, high: float) -> None:
-        if not low <= getattr(self, name) <= high:
-            raise ParsingError(f"`{name}` must be {low} to {high}, got {getattr(self, name)}.")
 
 
 # Not plain `spacemouse`: other public plug-ins have taken it, and where two register one name the second fails to load.
@@ -110,8 +108,8 @@ class SpaceMouseTwistConfig(TwistTeleoperatorConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_range("deadzone", 0.0, 0.9)
-        self._check_range("stale_after", 0.02, 1.0)
+        check_range(self, "deadzone", 0.0, 0.9)
+        check_range(self, "stale_after", 0.02, 1.0)
 
 
 @TeleoperatorConfig.register_subclass("keyboard_twist")
@@ -136,4 +134,4 @@ class KeyboardTwistConfig(TwistTeleoperatorConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_choice("keys", KEY_SOURCES)
-        self._check_range("key_hold", 0.02, 0.5)
+        check_range(self, "key_hold", 0.02, 0.5)

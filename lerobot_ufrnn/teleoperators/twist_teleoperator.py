@@ -12,7 +12,7 @@ from lerobot.teleoperators import Teleoperator
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 from numpy.typing import NDArray
 
-from lerobot_ufrnn.robots.ur5e_robotiq.configuration_ur5e_robotiq import JOINTS
+from lerobot_ufrnn.robots.ur5e_robotiq.configuration_ur5e_robotiq import FEATURES
 
 from .arm_state import ArmState
 from .configuration_twist import KeyboardTwistConfig, SpaceMouseTwistConfig, TwistTeleoperatorConfig
@@ -91,7 +91,7 @@ class TwistTeleoperator(Teleoperator):
     @property
     def action_features(self) -> dict[str, type]:
         """`dict[str, type]`: the robot's."""
-        return {f"{joint}.pos": float for joint in (*JOINTS, "gripper")}
+        return dict.fromkeys(FEATURES, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
@@ -170,7 +170,7 @@ class TwistTeleoperator(Teleoperator):
             self._gripper = float(np.clip(self._gripper + closing * self.config.gripper_speed * seconds, 0.0, 1.0))
         self._last = now
         values = (*joints.tolist(), self._gripper)
-        return dict(zip(self.action_features, values, strict=True))
+        return dict(zip(FEATURES, values, strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Nothing to do: the stock loops call this for other robots only, so nothing may depend on it.
@@ -220,14 +220,11 @@ class SpaceMouseTwist(TwistTeleoperator):
 
     config_class = SpaceMouseTwistConfig
     name = "spacemouse_twist"
-
-    def __init__(self, config: SpaceMouseTwistConfig):
-        super().__init__(config)
-        self._deadzone, self._stale_after = config.deadzone, config.stale_after
+    config: SpaceMouseTwistConfig
 
     def make_own_device(self) -> TwistDevice:
         """The SpaceMouse."""
-        return SpaceMouseDevice(self._deadzone, self._stale_after)
+        return SpaceMouseDevice(self.config.deadzone, self.config.stale_after)
 
 
 class KeyboardTwist(TwistTeleoperator):
@@ -240,11 +237,8 @@ class KeyboardTwist(TwistTeleoperator):
 
     config_class = KeyboardTwistConfig
     name = "keyboard_twist"
-
-    def __init__(self, config: KeyboardTwistConfig):
-        super().__init__(config)
-        self._keys, self._key_hold = config.keys, config.key_hold
+    config: KeyboardTwistConfig
 
     def make_own_device(self) -> TwistDevice:
         """The keyboard."""
-        return KeyboardDevice(make_key_source(self._keys, self._key_hold))
+        return KeyboardDevice(make_key_source(self.config.keys, self.config.key_hold))

@@ -8,10 +8,45 @@ from lerobot.cameras import CameraConfig
 from lerobot.robots import RobotConfig
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-"""Joints of the arm from base to wrist; features are `<joint>.pos` in rad and `gripper.pos`."""
+"""Joints of the arm from base to wrist."""
+
+FEATURES = tuple(f"{joint}.pos" for joint in (*JOINTS, "gripper"))
+"""Names of what is measured and commanded: joint angles in rad, and the gripper from 0, open, to 1, closed."""
 
 JOINT_RANGE = 2 * math.pi
 ELBOW_RANGE = math.pi
+
+
+def check_range(config: object, name: str, low: float, high: float) -> None:
+    """Refuses a field that is out of its range.
+
+    Args:
+        config (`object`):
+            A configuration.
+        name (`str`):
+            Its field.
+        low (`float`):
+            Smallest value allowed.
+        high (`float`):
+            Largest value allowed.
+
+    Raises:
+        ParsingError: If the value is out of range.
+    """
+    if not low <= getattr(config, name) <= high:
+        raise ParsingError(f"`{name}` must be {low} to {high}, got {getattr(config, name)}.")
+
+
+def check_address(config: object, name: str) -> None:
+    """Refuses an empty address of the controller; see `check_range`."""
+    if not getattr(config, name):
+        raise ParsingError(f"`{name}` must be the address of the controller, such as 192.168.1.10, got ''.")
+
+
+def check_gripper_range(gripper_range: tuple[int, ...]) -> None:
+    """Refuses readings of a gripper that are not those of an open and of a closed one; see `check_range`."""
+    if len(gripper_range) != 2 or not 0 <= gripper_range[0] < gripper_range[1] <= 255:
+        raise ParsingError(f"`gripper_range` must be two readings, 0 <= open < closed <= 255, got {gripper_range}.")
 
 
 @RobotConfig.register_subclass("ur5e_robotiq")
@@ -87,8 +122,7 @@ class UR5eRobotiqConfig(RobotConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.ip:
-            raise ParsingError("`ip` must be the address of the controller, such as 192.168.1.10, got ''.")
+        check_address(self, "ip")
         for name, low, high in (
             ("image_size", 0, 4096),
             ("control_period", 0.02, 1.0),
@@ -103,22 +137,14 @@ class UR5eRobotiqConfig(RobotConfig):
             ("gripper_force", 0.0, 1.0),
             ("gripper_speed", 0.0, 1.0),
         ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ParsingError(f"`{name}` must be {low} to {high}, got {value}.")
+            check_range(self, name, low, high)
         self._check_bounds("joint_low", "joint_high", len(JOINTS))
         self._check_bounds("workspace_low", "workspace_high", 3)
-        self._check_bounds("gripper_range", "gripper_range", 2)
-        opened, closed = self.gripper_range
-        if not 0 <= opened < closed <= 255:
-            raise ParsingError(
-                f"`gripper_range` must be two readings, 0 <= open < closed <= 255, got {opened, closed}."
-            )
+        check_gripper_range(self.gripper_range)
 
     def _check_bounds(self, low_name: str, high_name: str, size: int) -> None:
         low, high = getattr(self, low_name), getattr(self, high_name)
-        sizes_match = len(low) == len(high) == size
-        if not sizes_match or (low_name != high_name and not all(a < b for a, b in zip(low, high, strict=True))):
+        if not len(low) == len(high) == size or not all(a < b for a, b in zip(low, high, strict=True)):
             raise ParsingError(
                 f"`{low_name}` and `{high_name}` must hold {size} numbers each, low below high, got {low} and {high}."
             )

@@ -22,6 +22,12 @@ ACTIVE = 3
 FULL = 255
 
 
+def closure_at(reading: int, gripper_range: tuple[int, int]) -> float:
+    """Closure from 0, open, to 1, closed, at a reading of a gripper with this range."""
+    opened, closed = gripper_range
+    return min(max((reading - opened) / (closed - opened), 0.0), 1.0)
+
+
 class Gripper:
     """Follows a target and knows where it is; a thread of its own does the asking.
 
@@ -34,13 +40,11 @@ class Gripper:
 
     def __init__(self, config: UR5eRobotiqConfig):
         self._config = config
-        self._open, self._closed = config.gripper_range
         self._socket: socket.socket | None = None
-        self._rest = b""
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._target: int | None = None
-        self._position = self._open
+        self._position = config.gripper_range[0]
         self._fault: RobotFaultError | None = None
 
     def connect(self) -> None:
@@ -90,7 +94,7 @@ class Gripper:
         """
         if self._fault is not None:
             raise self._fault
-        return min(max((self._position - self._open) / (self._closed - self._open), 0.0), 1.0)
+        return closure_at(self._position, self._config.gripper_range)
 
     def move_to(self, closure: float) -> None:
         """Sets the target.
@@ -104,7 +108,8 @@ class Gripper:
         """
         if self._fault is not None:
             raise self._fault
-        self._target = round(self._open + closure * (self._closed - self._open))
+        opened, closed = self._config.gripper_range
+        self._target = round(opened + closure * (closed - opened))
 
     def _follow(self) -> None:
         sent = None

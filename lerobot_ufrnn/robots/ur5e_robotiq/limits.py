@@ -1,9 +1,11 @@
 """What may be sent to the arm: every target passes through here first."""
 
+from math import isfinite
+
 import numpy as np
 from numpy.typing import NDArray
 
-from .configuration_ur5e_robotiq import JOINTS, UR5eRobotiqConfig
+from .configuration_ur5e_robotiq import FEATURES, UR5eRobotiqConfig
 
 # Nominal kinematics of the UR5e as its maker publishes them (modified by a few 0.1 mm on each real arm).
 LINK_OFFSETS = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
@@ -68,14 +70,14 @@ class Limits:
         Raises:
             ValueError: If a value is missing, unknown or not finite.
         """
-        names = [f"{joint}.pos" for joint in (*JOINTS, "gripper")]
-        if set(action) != set(names):
+        if set(action) != set(FEATURES):
             raise ValueError(
-                f"An action must have exactly {names}, got {sorted(action)}; nothing was sent, the arm holds its pose."
+                f"An action must have exactly {list(FEATURES)}, got {sorted(action)}; "
+                "nothing was sent, the arm holds its pose."
             )
-        values = np.array([float(action[name]) for name in names])
+        values = np.array([float(action[name]) for name in FEATURES])
         if not np.isfinite(values).all():
-            wrong = {name: float(action[name]) for name in names if not np.isfinite(float(action[name]))}
+            wrong = {name: value for name, value in zip(FEATURES, values.tolist(), strict=True) if not isfinite(value)}
             raise ValueError(f"An action must be finite, got {wrong}; nothing was sent, the arm holds its pose.")
         return values[:-1], float(np.clip(values[-1], 0.0, 1.0))
 
@@ -98,12 +100,11 @@ class Limits:
         target = np.clip(target, self._low, self._high)
         target = np.clip(target, commanded - self._max_change, commanded + self._max_change)
         target = np.clip(target, measured - self._command_limit, measured + self._command_limit)
-        share = 1.0
-        for _ in range(HALVINGS):
-            shortened = commanded + share * (target - commanded)
-            if self._outside(shortened) <= self._outside(commanded):
+        outside = self._outside(commanded)
+        for halving in range(HALVINGS):
+            shortened = commanded + (target - commanded) / 2**halving
+            if self._outside(shortened) <= outside:
                 return shortened
-            share /= 2
         return commanded.copy()
 
     def _outside(self, joints: NDArray[np.float64]) -> float:

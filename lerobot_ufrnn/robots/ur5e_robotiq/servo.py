@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .client import import_client
 from .configuration_ur5e_robotiq import UR5eRobotiqConfig
 from .errors import Fault, RobotFaultError
 from .mailbox import Mailbox
@@ -30,30 +31,10 @@ ROBOT_MODE_RUNNING = 7
 SAFETY_NORMAL, SAFETY_REDUCED = 1, 2
 STOPPED_BY_SAFETY = {3: Fault.PROTECTIVE_STOP, 6: Fault.EMERGENCY_STOP, 7: Fault.EMERGENCY_STOP}
 
-# What the servo tells: measured joints, commanded joints, joint speeds, time of the data, fault, ticks, late ticks.
-STATE_SIZE = 6 + 6 + 6 + 4
+# What the servo tells.
+MEASURED, COMMANDED, FAULT = slice(0, 6), slice(6, 12), 12
+STATE_SIZE = 13
 TEXT_SIZE = 400
-
-
-def import_client() -> tuple[Any, Any, Any]:
-    """The three interfaces of `ur_rtde`.
-
-    Returns:
-        `tuple`: the modules `rtde_control`, `rtde_receive` and `dashboard_client`.
-
-    Raises:
-        ImportError: If it is not installed; says how to.
-    """
-    try:
-        import dashboard_client
-        import rtde_control
-        import rtde_receive
-    except ImportError as error:
-        raise ImportError(
-            f"--robot.type=ur5e_robotiq needs ur_rtde, which cannot be imported ({error}): "
-            "`pip install 'lerobot_policy_ufrnn[ur5e]'`. Everything else works without it."
-        ) from error
-    return rtde_control, rtde_receive, dashboard_client
 
 
 class Servo:
@@ -105,15 +86,10 @@ class Servo:
                 self._process.join(timeout=1.0)
 
     @property
-    def is_alive(self) -> bool:
-        """`bool`: whether the process runs."""
-        return self._process.is_alive()
-
-    @property
     def fault(self) -> RobotFaultError | None:
         """`RobotFaultError | None`: why the arm was stopped, if it was."""
         _, values = self._state.read()
-        fault = Fault(int(values[19]))
+        fault = Fault(int(values[FAULT]))
         if fault is not Fault.NONE:
             return RobotFaultError(fault, self._text.value.decode(errors="replace") or "no details")
         if self._process.pid is not None and not self._process.is_alive() and not self._stop.is_set():
@@ -140,7 +116,7 @@ class Servo:
         """
         self.check()
         _, values = self._state.read()
-        return values[:6], values[6:12]
+        return values[MEASURED], values[COMMANDED]
 
     def move_to(self, target: NDArray[np.float64]) -> None:
         """Sets the target that the arm is to be at one control period from now.
@@ -154,12 +130,6 @@ class Servo:
         """
         self.check()
         self._targets.write(target)
-
-    @property
-    def timing(self) -> tuple[int, int]:
-        """`tuple[int, int]`: set-points sent, and how many of them came more than a period late."""
-        _, values = self._state.read()
-        return int(values[20]), int(values[21])
 
 
 class _StopError(Exception):
@@ -200,7 +170,7 @@ def _run(
 
 def _tell(state: Mailbox, text: Any, values: NDArray[np.float64], fault: Fault, detail: str) -> None:
     text.value = detail.encode()[: TEXT_SIZE - 1]
-    values[19] = fault
+    values[FAULT] = fault
     state.write(values)
 
 
@@ -243,7 +213,6 @@ def _servo(
     begin = end = commanded
     began, seen = time.monotonic(), targets.read()[0]
     stamp, stamped = receive.getTimestamp(), time.monotonic()
-    ticks = late = 0
     due = time.monotonic()
     while not stop.is_set():
         now = time.monotonic()
@@ -267,14 +236,11 @@ def _servo(
             _check(config, owner, control, receive, now, stamped)
             raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
         # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
-        ticks += 1
-        values[:6], values[6:12], values[12:18] = measured, commanded, receive.getActualQd()
-        values[18], values[20], values[21] = stamped, ticks, late
+        values[MEASURED], values[COMMANDED] = measured, commanded
         state.write(values)
         ready.set()
         due += period
         if (behind := time.monotonic() - due) > 0:
-            late += behind > period
             if behind > config.stale_after:
                 raise _StopError(Fault.SERVO_LATE, f"a set-point came {1000 * behind:.0f} ms late")
             due = time.monotonic()

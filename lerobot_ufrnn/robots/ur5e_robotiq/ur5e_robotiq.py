@@ -12,11 +12,12 @@ from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
-from .configuration_ur5e_robotiq import JOINTS, UR5eRobotiqConfig
+from .client import import_client
+from .configuration_ur5e_robotiq import FEATURES, UR5eRobotiqConfig
 from .errors import Fault, RobotFaultError
 from .gripper import Gripper
 from .limits import Limits
-from .servo import Servo, import_client
+from .servo import Servo
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ class UR5eRobotiq(Robot):
     @cached_property
     def action_features(self) -> dict[str, type]:
         """`dict`: `<joint>.pos` in rad and `gripper.pos` from 0 to 1."""
-        return {f"{joint}.pos": float for joint in (*JOINTS, "gripper")}
+        return dict.fromkeys(FEATURES, float)
 
     @property
     def is_connected(self) -> bool:
@@ -145,9 +146,7 @@ class UR5eRobotiq(Robot):
             measured, _ = self._servo.read()
             closure = self._gripper.closure if self._gripper is not None else 0.0
             values = [*measured, closure]
-            observation: dict[str, Any] = {
-                name: float(value) for name, value in zip(self.action_features, values, strict=True)
-            }
+            observation: dict[str, Any] = {name: float(value) for name, value in zip(FEATURES, values, strict=True)}
             for name, camera in self.cameras.items():
                 try:
                     image = camera.read_latest(max_age_ms=MAX_IMAGE_AGE_MS)
@@ -185,7 +184,7 @@ class UR5eRobotiq(Robot):
             self._servo.move_to(target)
             if self._gripper is not None:
                 self._gripper.move_to(closure)
-        return {name: float(value) for name, value in zip(self.action_features, [*target, closure], strict=True)}
+        return {name: float(value) for name, value in zip(FEATURES, [*target, closure], strict=True)}
 
     @check_if_not_connected
     def disconnect(self) -> None:
