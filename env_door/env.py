@@ -213,13 +213,9 @@ class DoorEnv(gym.Env):
         velocity = (target - start) / (CONTROL_STEPS * self.model.opt.timestep)
         progress = np.arange(1, CONTROL_STEPS + 1)[:, None] / CONTROL_STEPS
         for control in self._control(start + (target - start) * progress, velocity):
-            self.data.ctrl[self._actuators] = control
-            mujoco.mj_step(self.model, self.data)
-            self.latch.update()
+            self._step_physics(control)
         self._target = target
-        if self._to_be_held and self.latch.opening >= HOLD_OPENING:
-            self._to_be_held = False
-            self.hold_door(self.hold_seconds)
+        self._hold_if_due()
         self._check_physics()
 
     def limit_action(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -293,6 +289,16 @@ class DoorEnv(gym.Env):
         control = target + self._servo_lag * velocity
         control[..., -1] *= GRIPPER_STROKE
         return control
+
+    def _step_physics(self, control: NDArray[np.float64]) -> None:
+        self.data.ctrl[self._actuators] = control
+        mujoco.mj_step(self.model, self.data)
+        self.latch.update()
+
+    def _hold_if_due(self) -> None:
+        if self._to_be_held and self.latch.opening >= HOLD_OPENING:
+            self._to_be_held = False
+            self.hold_door(self.hold_seconds)
 
     def _check_physics(self) -> None:
         if not np.isfinite(self.data.qpos).all() or any(self.data.warning.number):

@@ -113,9 +113,10 @@ class Alternatives:
         Returns:
             `Tensor`: sum of the weighted likenesses, (N,).
         """
+        width = (SAME_FUTURE * (self.ends - here).norm(dim=-1).median()).clamp(min=1e-6)
         refuted = torch.zeros_like(self.ends[:, 0])
         for weight, end in failures:
-            refuted += weight * self._likeness(end[None], here)[:, 0]
+            refuted += weight * torch.exp(-0.5 * ((self.ends - end).norm(dim=-1) / width).square())
         return refuted
 
     def choose(self, refuted: Tensor, here: Tensor) -> int:
@@ -140,8 +141,3 @@ class Alternatives:
         if closed.all():
             return int(refuted.argmin())
         return int((left + leap).masked_fill(closed, math.inf).argmin())
-
-    def _likeness(self, others: Tensor, here: Tensor) -> Tensor:
-        """How alike the ends are to other ends, (N, number of others)."""
-        width = (SAME_FUTURE * (self.ends - here).norm(dim=-1).median()).clamp(min=1e-6)
-        return torch.exp(-0.5 * (torch.cdist(self.ends, others) / width).square())

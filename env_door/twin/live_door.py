@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from env_door.env import HOLD_OPENING, DoorEnv
+from env_door.env import DoorEnv
 from env_door.kinematics import rotation_about, rotation_vector
 
 GRIP_FORCE = 140.0
@@ -74,12 +74,8 @@ class LiveDoor(DoorEnv):
         Raises:
             RuntimeError: If the physics diverged.
         """
-        self.data.ctrl[self._actuators] = self._control(np.append(joints, closure), np.append(velocity, 0.0))
-        mujoco.mj_step(self.model, self.data)
-        self.latch.update()
-        if self._to_be_held and self.latch.opening >= HOLD_OPENING:
-            self._to_be_held = False
-            self.hold_door(self.hold_seconds)
+        self._step_physics(self._control(np.append(joints, closure), np.append(velocity, 0.0)))
+        self._hold_if_due()
 
     def check(self) -> None:
         """Looks whether the physics is still sound; too dear for every step.

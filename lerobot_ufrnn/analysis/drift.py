@@ -16,13 +16,14 @@ from .hidden_states import states_along
 
 @torch.no_grad()
 def imagined_drift(policy: UFRNNPolicy, demonstrations: Sequence[Episode], num_steps: int) -> list[Tensor]:
-    """Distance of imagined poses from the nearest demonstrated one, without exploration noise.
+    """Distance of imagined poses from the nearest demonstrated one; imagining itself adds no noise.
 
     Args:
         policy (`UFRNNPolicy`):
             Trained policy.
         demonstrations (`Sequence[Episode]`):
-            From each of their steps it imagines; all their poses count as demonstrated.
+            It reads them, exploring as it does when it acts, and imagines from each of their steps; all their poses
+            count as demonstrated.
         num_steps (`int`):
             Number of imagined steps T.
 

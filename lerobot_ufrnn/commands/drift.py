@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from lerobot.utils.random_utils import set_seed
 
 from ..analysis.drift import imagined_drift
 from ..analysis.hidden_states import read_demonstrations
@@ -24,12 +25,15 @@ class DriftConfig:
             Names of the policies; those of the paper by default.
         horizon (`int`, *optional*, defaults to `30`):
             Number T of imagined steps.
+        seed (`int`, *optional*, defaults to `2000`):
+            Seed of the exploration while it reads the demonstrations.
     """
 
     policy_paths: list[str]
     dataset_dir: Path
     labels: list[str] = field(default_factory=list)
     horizon: int = 30
+    seed: int = 2000
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
@@ -45,5 +49,6 @@ def run(arguments: list[str]) -> None:
     print("the range of a joint): mean, and 95th percentile over where imagining starts.\n")
     print("| model | mean | 95th percentile |\n|---|---|---|")
     for label, policy in load_policies(config.policy_paths, config.labels).items():
+        set_seed(config.seed)
         drift = torch.cat(imagined_drift(policy, read_demonstrations(policy, config.dataset_dir), config.horizon))
         print(f"| {label} | {drift.mean():.3f} | {drift.quantile(0.95):.3f} |")

@@ -158,6 +158,23 @@ def _perturb(
 
 
 @compiled
+def _workspace(
+    weights: Weights, sizes: Sizes, num_rows: int, number: np.dtype
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Room for imagining R futures: inputs of the two lower cells, gates of the three cells, and what a head reads."""
+    mean = max(weights.joint_mean_bias.shape[0], weights.image_mean_bias.shape[0])
+    spread = max(weights.joint_spread_bias.shape[0], weights.image_spread_bias.shape[0])
+    return (
+        np.empty((num_rows, sizes.joint_dim + sizes.shared_hidden), number),
+        np.empty((num_rows, sizes.feature_dim + sizes.shared_hidden), number),
+        np.empty((num_rows, weights.shared_bias.shape[0]), number),
+        np.empty((num_rows, weights.joint_bias.shape[0]), number),
+        np.empty((num_rows, weights.image_bias.shape[0]), number),
+        np.zeros((num_rows, max(mean, spread)), number),
+    )
+
+
+@compiled
 def walk(
     weights: Weights,
     sizes: Sizes,
@@ -199,14 +216,11 @@ def walk(
     number = hidden.dtype
     num_samples, num_episodes, size = noise.shape[1], hidden.shape[0], hidden.shape[1]
     num_rows = num_samples * num_episodes  # candidate-major
-    scratch = np.zeros((num_rows, max(weights.joint_spread_bias.shape[0], weights.image_spread_bias.shape[0])), number)
+    joint_input, image_input, shared_gates, joint_gates, image_gates, scratch = _workspace(
+        weights, sizes, num_rows, number
+    )
     means, step_scalars = np.empty((num_rows, 2), number), np.empty((num_rows, 2), number)
     noisy_hidden, noisy_cell = np.empty((num_rows, size), number), np.empty((num_rows, size), number)
-    joint_input = np.empty((num_rows, steps.joint_input.shape[2]), number)
-    image_input = np.empty((num_rows, steps.image_input.shape[2]), number)
-    shared_gates = np.empty((num_rows, steps.shared_gates.shape[2]), number)
-    joint_gates = np.empty((num_rows, steps.joint_gates.shape[2]), number)
-    image_gates = np.empty((num_rows, steps.image_gates.shape[2]), number)
     uncertainties = np.empty((options.horizon, num_rows), number)
 
     for t in range(inputs.shape[0]):
@@ -326,13 +340,9 @@ def imagine(
             Which states.
     """
     hidden, cell = hidden_steps[0, first:last].copy(), cell_steps[0, first:last].copy()
-    number, num_rows = hidden.dtype, hidden.shape[0]
-    scratch = np.zeros((num_rows, max(weights.joint_mean_bias.shape[0], weights.image_mean_bias.shape[0])), number)
-    joint_input = np.empty((num_rows, sizes.joint_dim + sizes.shared_hidden), number)
-    image_input = np.empty((num_rows, sizes.feature_dim + sizes.shared_hidden), number)
-    shared_gates = np.empty((num_rows, weights.shared_bias.shape[0]), number)
-    joint_gates = np.empty((num_rows, weights.joint_bias.shape[0]), number)
-    image_gates = np.empty((num_rows, weights.image_bias.shape[0]), number)
+    joint_input, image_input, shared_gates, joint_gates, image_gates, scratch = _workspace(
+        weights, sizes, hidden.shape[0], hidden.dtype
+    )
     for t in range(1, hidden_steps.shape[0]):
         _imagine_inputs(weights, sizes, hidden, joint_input, image_input, scratch)
         _step(weights, sizes, hidden, cell, joint_input, image_input, shared_gates, joint_gates, image_gates)

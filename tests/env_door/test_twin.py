@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 from env_door.demonstration import demonstrate
 from env_door.env import DoorEnv
@@ -20,13 +21,6 @@ dashboard_client = pytest.importorskip("dashboard_client")
 
 RATE = 125.0
 SERVO = (0.5, 0.5, 1 / RATE, 0.1, 300.0)
-
-
-def until(condition, seconds=6.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not become so in time"
-        time.sleep(0.01)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +48,7 @@ def with_dashboard(twin, work):
 
 def recover(twin, dashboard):
     if twin.state()["safety_mode"] == "PROTECTIVE_STOP":
-        until(lambda: unlocked(dashboard))
+        wait_until(lambda: unlocked(dashboard))
     if twin.state()["robot_mode"] != "RUNNING":
         dashboard.powerOn()
         twin.wait_for(robot_mode="IDLE")
@@ -129,9 +123,9 @@ def test_servo_moves_the_arm_by_what_was_asked_for(twin, control, receive):
     before = np.array(receive.getActualQ())
     change = [0.1, -0.05, 0.05, 0.0, 0.1, -0.2]
     assert servo(control, receive, change, 0.8)
-    until(lambda: np.abs(receive.getActualQ() - before - change).max() < 0.01)  # it trails by the lookahead
+    wait_until(lambda: np.abs(receive.getActualQ() - before - change).max() < 0.01)  # it trails by the lookahead
     assert control.servoStop(10.0)
-    until(control.isSteady)
+    wait_until(control.isSteady)
     np.testing.assert_allclose(np.array(receive.getActualQ()) - before, change, atol=0.01)
     assert twin.state()["motion"] == "hold"
 
@@ -145,7 +139,7 @@ def test_move_arrives_before_it_returns_and_asynchronously_after(twin, control, 
     assert control.getAsyncOperationProgress() >= 0
     control.stopJ(5.0)
     assert twin.state()["motion"] == "hold"
-    until(lambda: control.getAsyncOperationProgress() < 0)
+    wait_until(lambda: control.getAsyncOperationProgress() < 0)
     assert twin.state()["targets"]["shoulder_pan"] > target[0] - 0.09
 
 
@@ -163,7 +157,7 @@ def test_stopping_the_script_and_uploading_it_again(control, receive):
     assert not control.isProgramRunning()
     assert not control.servoJ(receive.getActualQ(), *SERVO)
     assert control.reuploadScript()
-    until(control.isProgramRunning)
+    wait_until(control.isProgramRunning)
     assert control.servoJ(receive.getActualQ(), *SERVO)
 
 
@@ -198,14 +192,14 @@ def test_watchdog_stops_the_arm_when_the_client_falls_silent(twin, control, rece
     assert servo(control, receive, [0.1, 0, 0, 0, 0, 0], 0.5)
     assert twin.state()["program"] == "PLAYING"
     twin.wait_for(program="STOPPED", motion="hold")
-    until(lambda: not control.isProgramRunning())
+    wait_until(lambda: not control.isProgramRunning())
     assert not control.kickWatchdog()
     assert not control.servoJ(receive.getActualQ(), *SERVO)
 
 
 def test_dropped_link_leaves_stale_values_and_can_be_made_again(twin, control, receive):
     twin.fault("drop_link")
-    until(lambda: not control.isConnected() and not receive.isConnected())
+    wait_until(lambda: not control.isConnected() and not receive.isConnected())
     stale = receive.getTimestamp()
     time.sleep(0.05)
     assert receive.getTimestamp() == stale
@@ -227,12 +221,12 @@ def test_frozen_link_stays_connected_while_nothing_comes(twin, receive):
     assert receive.getTimestamp() == stale
     assert receive.isConnected()
     twin.clear()
-    until(lambda: receive.getTimestamp() > stale)
+    wait_until(lambda: receive.getTimestamp() > stale)
 
 
 def test_frozen_for_long_the_client_gives_up(twin, receive):
     twin.fault("freeze")
-    until(lambda: not receive.isConnected())
+    wait_until(lambda: not receive.isConnected())
 
 
 def test_watchdog_trips_during_a_freeze(twin, control, receive):
@@ -243,7 +237,7 @@ def test_watchdog_trips_during_a_freeze(twin, control, receive):
     assert control.isProgramRunning()
     twin.wait_for(program="STOPPED", seconds=1.5)
     twin.clear()
-    until(lambda: not control.isProgramRunning())
+    wait_until(lambda: not control.isProgramRunning())
 
 
 def test_delayed_measurements(twin, receive):
@@ -252,62 +246,62 @@ def test_delayed_measurements(twin, receive):
 
     assert lateness() < 0.15
     twin.fault("delay", ms=400.0)
-    until(lambda: lateness() > 0.35)
+    wait_until(lambda: lateness() > 0.35)
     assert receive.isConnected()
     twin.clear("delay")
-    until(lambda: lateness() < 0.15)
+    wait_until(lambda: lateness() < 0.15)
 
 
 def test_protective_stop(twin, control, receive):
     assert control.servoJ(receive.getActualQ(), *SERVO)
     twin.fault("protective_stop")
-    until(receive.isProtectiveStopped)
-    until(lambda: not control.isProgramRunning())
+    wait_until(receive.isProtectiveStopped)
+    wait_until(lambda: not control.isProgramRunning())
     assert not control.servoJ(receive.getActualQ(), *SERVO)
     assert receive.getSafetyMode() == 3
 
     def unlock(dashboard):
         assert dashboard.safetystatus() == "Safetystatus: PROTECTIVE_STOP"
-        until(lambda: unlocked(dashboard))
+        wait_until(lambda: unlocked(dashboard))
 
     with_dashboard(twin, unlock)
-    until(lambda: not receive.isProtectiveStopped())
+    wait_until(lambda: not receive.isProtectiveStopped())
     assert not control.servoJ(receive.getActualQ(), *SERVO)
     assert control.reuploadScript()
-    until(control.isProgramRunning)
+    wait_until(control.isProgramRunning)
     assert control.servoJ(receive.getActualQ(), *SERVO)
 
 
 def test_protective_stop_stops_the_moving_arm(twin, control, receive):
     assert control.moveJ(list(np.add(receive.getActualQ(), [0.5, 0, 0, 0, 0, 0])), 1.0, 2.0, True)
-    until(lambda: twin.state()["arm_speed"] > 0.2)
+    wait_until(lambda: twin.state()["arm_speed"] > 0.2)
     assert not control.triggerProtectiveStop()
-    until(lambda: twin.state()["arm_speed"] < 0.01)
+    wait_until(lambda: twin.state()["arm_speed"] < 0.01)
     assert twin.state()["safety_mode"] == "PROTECTIVE_STOP"
 
 
 def test_emergency_stop_takes_the_power_away(twin, control, receive):
     twin.fault("emergency_stop")
-    until(lambda: receive.isEmergencyStopped() and not control.isProgramRunning())
+    wait_until(lambda: receive.isEmergencyStopped() and not control.isProgramRunning())
     assert receive.getRobotMode() == 3
     assert not control.servoJ(receive.getActualQ(), *SERVO)
     twin.clear()
-    until(lambda: not receive.isEmergencyStopped())
+    wait_until(lambda: not receive.isEmergencyStopped())
     with_dashboard(twin, lambda dashboard: recover(twin, dashboard))
     assert control.reuploadScript()
-    until(control.isProgramRunning)
+    wait_until(control.isProgramRunning)
 
 
 def test_power_off(twin, control, receive):
     twin.fault("power_off")
-    until(lambda: receive.getRobotMode() == 3)
+    wait_until(lambda: receive.getRobotMode() == 3)
     assert not control.servoJ(receive.getActualQ(), *SERVO)
     assert not receive.isEmergencyStopped()
 
 
 def test_program_stopped_on_the_pendant(twin, control, receive):
     twin.fault("script_stop")
-    until(lambda: not control.isProgramRunning())
+    wait_until(lambda: not control.isProgramRunning())
     assert not control.servoJ(receive.getActualQ(), *SERVO)
     assert receive.getSafetyMode() == 1
 
@@ -334,13 +328,13 @@ def test_gripper_closes_and_opens(twin):
             return gripper.recv(100).decode().strip()
 
         assert ask("SET ACT 1") == "ack"
-        until(lambda: ask("GET STA") == "STA 3")
+        wait_until(lambda: ask("GET STA") == "STA 3")
         assert ask("SET GTO 1 SPE 255 FOR 200 POS 255") == "ack"
-        until(lambda: ask("GET OBJ") == "OBJ 3")
+        wait_until(lambda: ask("GET OBJ") == "OBJ 3")
         assert ask("GET POS") == "POS 230"
         assert twin.state()["joints"]["gripper"] == pytest.approx(1.0, abs=0.01)
         assert ask("SET POS 0") == "ack"
-        until(lambda: ask("GET POS") == "POS 3")
+        wait_until(lambda: ask("GET POS") == "POS 3")
 
 
 def test_a_twin_tells_when_its_address_is_taken(twin):
@@ -371,7 +365,7 @@ def test_it_dies_with_its_parent():
         except FileNotFoundError:
             return True
 
-    until(gone)
+    wait_until(gone)
 
 
 @pytest.mark.parametrize(

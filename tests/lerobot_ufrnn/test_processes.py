@@ -3,9 +3,9 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
+from waiting import wait_until
 
 from lerobot_ufrnn.experiments import processes
 from lerobot_ufrnn.experiments.processes import Runner, Stopped, with_this_python
@@ -17,13 +17,6 @@ SLEEP = "import time; print('asleep', flush=True); time.sleep(60)"
 def plain(monkeypatch):
     """Lets a command be Python code."""
     monkeypatch.setattr(processes, "with_this_python", lambda command: [sys.executable, "-c", *command])
-
-
-def wait_for(condition) -> None:
-    limit = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.02)
 
 
 def test_commands_are_modules_of_this_python():
@@ -58,7 +51,7 @@ def test_stopping_ends_what_runs_and_starts_no_more(plain, tmp_path):
 
     thread = threading.Thread(target=work)
     thread.start()
-    wait_for(lambda: (tmp_path / "log").exists() and "asleep\n" in (tmp_path / "log").read_text())
+    wait_until(lambda: (tmp_path / "log").exists() and "asleep\n" in (tmp_path / "log").read_text())
     runner.stop()
     thread.join(20)
     assert stopped
@@ -78,7 +71,7 @@ with runner.hold(Path("lock")) as lock:
     runner.run(["import os; print(os.getpid(), flush=True)\\n" + {SLEEP!r}], Path("log"), lock)
 """
     killed = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path)
-    wait_for(lambda: (tmp_path / "log").exists() and "asleep\n" in (tmp_path / "log").read_text())
+    wait_until(lambda: (tmp_path / "log").exists() and "asleep\n" in (tmp_path / "log").read_text())
     killed.kill()
     killed.wait()
     left = int((tmp_path / "log").read_text().splitlines()[-2])

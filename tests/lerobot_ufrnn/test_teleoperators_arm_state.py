@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import teleoperators_fakes as fakes
 from teleoperators_controller import ADDRESS, CLOSED, ONE_PACKAGE, RUNNING, SILENT, run_controller
+from waiting import wait_until
 
 from lerobot_ufrnn.teleoperators import ArmStateError
 from lerobot_ufrnn.teleoperators.arm_state import ArmState
@@ -42,13 +43,6 @@ def answer_gripper(answer):
 
     threading.Thread(target=serve, daemon=True).start()
     return server.getsockname()[1]
-
-
-def wait_until(condition, seconds=5.0):
-    deadline = time.monotonic() + seconds
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert condition()
 
 
 def test_joints_are_the_controllers_and_follow_it(controller):

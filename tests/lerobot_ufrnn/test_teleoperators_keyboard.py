@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from lerobot.utils import keyboard_input
 from teleoperators_fakes import Clock
+from waiting import wait_until
 
 from lerobot_ufrnn.teleoperators import DeviceLostError, DeviceUnavailableError, key_sources
 from lerobot_ufrnn.teleoperators.key_sources import KeySource, PynputKeys, make_key_source
@@ -75,13 +76,6 @@ def terminal(monkeypatch):
         yield terminal
     if terminal.master >= 0:
         os.close(master)
-
-
-def wait_until(condition, seconds=5.0):
-    deadline = time.monotonic() + seconds
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    assert condition()
 
 
 def test_a_key_of_the_terminal_is_held_for_a_moment(terminal):

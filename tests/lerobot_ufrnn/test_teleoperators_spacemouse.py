@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from teleoperators_fakes import Clock
+from waiting import wait_until
 
 from lerobot_ufrnn.teleoperators import DeviceLostError, DeviceUnavailableError
 from lerobot_ufrnn.teleoperators.spacemouse_device import SpaceMouseDevice
@@ -46,13 +47,6 @@ def library(monkeypatch):
     library.open = open_mouse
     monkeypatch.setitem(sys.modules, "pyspacemouse", library)
     return library
-
-
-def wait_until(condition, seconds=5.0):
-    deadline = time.monotonic() + seconds
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.002)
-    assert condition()
 
 
 @pytest.fixture

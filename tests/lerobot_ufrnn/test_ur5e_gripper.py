@@ -4,9 +4,9 @@ import contextlib
 import socket
 import threading
 import time
-from collections.abc import Callable
 
 import pytest
+from waiting import wait_until
 
 from lerobot_ufrnn.robots.ur5e_robotiq import Fault, RobotFaultError, UR5eRobotiqConfig
 from lerobot_ufrnn.robots.ur5e_robotiq import gripper as gripper_module
@@ -78,13 +78,6 @@ def connected(fake):
         each.disconnect()
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 5
-    while not condition():
-        assert time.monotonic() < deadline, "never happened"
-        time.sleep(0.01)
-
-
 def raises_soon(gripper: Gripper) -> RobotFaultError:
     found = []
 
@@ -95,7 +88,7 @@ def raises_soon(gripper: Gripper) -> RobotFaultError:
             found.append(error)
         return bool(found)
 
-    wait_for(failed)
+    wait_until(failed)
     return found[0]
 
 
@@ -121,8 +114,8 @@ def test_targets_and_readings_share_one_scale(fake, connected, closure, position
     server.values["POS"] = 99
     gripper = connected(server)
     gripper.move_to(closure)
-    wait_for(lambda: server.values["POS"] == position)
-    wait_for(lambda: gripper.closure == pytest.approx(closure, abs=0.005))
+    wait_until(lambda: server.values["POS"] == position)
+    wait_until(lambda: gripper.closure == pytest.approx(closure, abs=0.005))
     sent = [command for command in server.commands if command.startswith("SET POS")]
     assert sent == [f"SET POS {position}"]  # once, not at every poll
 
@@ -131,9 +124,9 @@ def test_a_reading_beyond_the_range_is_open_or_closed(fake, connected):
     server = fake()
     gripper = connected(server)
     server.values["POS"] = 255
-    wait_for(lambda: gripper.closure == 1.0)
+    wait_until(lambda: gripper.closure == 1.0)
     server.values["POS"] = 0
-    wait_for(lambda: gripper.closure == 0.0)
+    wait_until(lambda: gripper.closure == 0.0)
 
 
 def test_where_nobody_listens_there_is_no_gripper():
@@ -179,7 +172,7 @@ def test_disconnecting_neither_opens_nor_closes(fake, connected):
     server = fake()
     gripper = connected(server)
     gripper.move_to(0.7)
-    wait_for(lambda: server.values["POS"] > 100)
+    wait_until(lambda: server.values["POS"] > 100)
     before = len([command for command in server.commands if command.startswith("SET")])
     gripper.disconnect()
     gripper.disconnect()
