@@ -27,6 +27,9 @@ START_SECONDS = 60.0
 STOP_DECELERATION = 4.0
 """Deceleration in rad/s^2 with which the arm is stopped."""
 
+SETTLE_SECONDS = 0.1
+"""How long the values that tell of one cause may take to come in."""
+
 ROBOT_MODE_RUNNING = 7
 SAFETY_NORMAL, SAFETY_REDUCED = 1, 2
 STOPPED_BY_SAFETY = {3: Fault.PROTECTIVE_STOP, 6: Fault.EMERGENCY_STOP, 7: Fault.EMERGENCY_STOP}
@@ -232,7 +235,7 @@ def _servo(
         except RuntimeError as error:  # the client found the link broken and tried in vain to mend it
             raise _StopError(Fault.LINK_LOST, str(error)) from error
         if not taken:
-            time.sleep(0.1)  # so that the reason has come
+            time.sleep(SETTLE_SECONDS)
             _check(config, owner, control, receive, now, stamped)
             raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
         # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
@@ -254,19 +257,21 @@ def _check(config: UR5eRobotiqConfig, owner: int, control: Any, receive: Any, no
         raise _StopError(Fault.LINK_LOST, f"the connection to {config.ip} broke")
     if now - stamped > config.stale_after:
         raise _StopError(Fault.STALE_DATA, f"no new data from {config.ip} for {1000 * (now - stamped):.0f} ms")
-    _check_safety(receive)
-    if not control.isProgramRunning():
-        # A stop for safety ends the program, too, but is told on another connection, perhaps a little later.
-        time.sleep(0.1)
-        _check_safety(receive)
-        raise _StopError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
+    if _interruption(control, receive) is not None:
+        # One cause shows in several values, which come one after the other and over two connections: nothing more is
+        # commanded while the rest comes in, then the most telling one counts.
+        time.sleep(SETTLE_SECONDS)
+        raise _interruption(control, receive) or _StopError(Fault.PROGRAM_STOPPED, "the controller paused the program")
     if os.getppid() != owner:
         raise _StopError(Fault.OWNER_GONE, "the program that commanded it ended")
 
 
-def _check_safety(receive: Any) -> None:
-    safety = receive.getSafetyMode()
-    if safety not in (SAFETY_NORMAL, SAFETY_REDUCED):
-        raise _StopError(STOPPED_BY_SAFETY.get(safety, Fault.PROTECTIVE_STOP), f"safety mode {safety}")
+def _interruption(control: Any, receive: Any) -> _StopError | None:
+    """Why the controller does not carry out commands, if it says so; the most telling reason first."""
+    if (safety := receive.getSafetyMode()) not in (SAFETY_NORMAL, SAFETY_REDUCED):
+        return _StopError(STOPPED_BY_SAFETY.get(safety, Fault.PROTECTIVE_STOP), f"safety mode {safety}")
     if (mode := receive.getRobotMode()) != ROBOT_MODE_RUNNING:
-        raise _StopError(Fault.NOT_RUNNING, f"robot mode {mode} instead of {ROBOT_MODE_RUNNING} (running)")
+        return _StopError(Fault.NOT_RUNNING, f"robot mode {mode} instead of {ROBOT_MODE_RUNNING} (running)")
+    if not control.isProgramRunning():
+        return _StopError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
+    return None
