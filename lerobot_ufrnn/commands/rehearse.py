@@ -1,28 +1,23 @@
 """`ufrnn rehearse`: door trials of a policy on the digital twin, through stock `lerobot-rollout`."""
 
-import signal
-import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from env_door.env import MAX_HOLD
 from env_door.latch import KINDS
 from env_door.trials import Trial, append_trial, read_trials
-from env_door.twin import TwinProcess, ports
+from env_door.twin import TwinProcess
 
 from ..analysis.results import summarize, to_markdown
-from ..experiments.processes import with_this_python
 from .flags import parse_flags
+from .stock import FPS, StockCommand, twin_flags
 
-FPS = 10
 START_SECONDS = 120.0
 """Longest time for a roll-out to load its policy and connect."""
 
-END_SECONDS = 30.0
 POLL_SECONDS = 0.05
 SLOW = "running slower"
 """What `lerobot-rollout` warns of when a tick was late."""
@@ -106,39 +101,20 @@ def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tup
         RuntimeError: If the roll-out fails; the message has the end of its output.
     """
     twin.reset(kind, seed)
-    with tempfile.TemporaryFile() as output:
-        rollout = subprocess.Popen(
-            with_this_python(_rollout(config, twin.address)),
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-        try:
-            trial = _watch(config, twin, rollout, kind, seed)
-        finally:
-            if rollout.poll() is None:
-                rollout.send_signal(signal.SIGINT)  # LeRobot's own way to end a roll-out early
-            try:
-                rollout.wait(END_SECONDS)
-            except subprocess.TimeoutExpired:
-                rollout.kill()
-                rollout.wait()
-        text = _text(output)
+    with StockCommand(_rollout(config, twin.address)) as rollout:
+        trial = _watch(config, twin, rollout, kind, seed)
+        rollout.stop()
+        text = rollout.output()
     if trial is None:
-        raise RuntimeError(f"lerobot-rollout ended with status {rollout.returncode} too soon:\n{text[-2000:]}")
+        raise RuntimeError(f"lerobot-rollout ended with status {rollout.process.returncode} too soon:\n{text[-2000:]}")
     return trial, text.count(SLOW)
 
 
 def _rollout(config: RehearseConfig, address: str) -> list[str]:
-    camera = f"{{type: zmq, server_address: {address}, port: {ports.CAMERA}, camera_name: front"
     return [
         "lerobot-rollout",
         f"--policy.path={config.policy_path}",
-        "--robot.type=ur5e_robotiq",
-        "--robot.id=twin",
-        f"--robot.ip={address}",
-        f"--robot.cameras={{front: {camera}, width: 640, height: 480, fps: 30}}}}",
+        *twin_flags(address),
         f"--fps={FPS}",
         f"--duration={config.duration}",
         "--task=open the door",
@@ -146,7 +122,7 @@ def _rollout(config: RehearseConfig, address: str) -> list[str]:
     ]
 
 
-def _watch(config: RehearseConfig, twin: TwinProcess, rollout: subprocess.Popen, kind: str, seed: int) -> Trial | None:
+def _watch(config: RehearseConfig, twin: TwinProcess, rollout: StockCommand, kind: str, seed: int) -> Trial | None:
     """Looks on until the door is open or the time is over; `None` if the roll-out ends before it moved the arm."""
     begin = held_at = None
     deadline = time.monotonic() + START_SECONDS + config.duration
@@ -159,9 +135,9 @@ def _watch(config: RehearseConfig, twin: TwinProcess, rollout: subprocess.Popen,
             steps = round((state["time"] - begin) * FPS)
             if state["held"] and held_at is None:
                 held_at = steps
-            if state["is_open"] or steps >= config.duration * FPS or rollout.poll() is not None:
+            if state["is_open"] or steps >= config.duration * FPS or rollout.has_ended:
                 break
-        elif rollout.poll() is not None:
+        elif rollout.has_ended:
             return None
         time.sleep(POLL_SECONDS)
     if begin is None:
@@ -177,8 +153,3 @@ def _watch(config: RehearseConfig, twin: TwinProcess, rollout: subprocess.Popen,
         held_at=held_at,
         tried_while_held=tuple(state["tried_while_held"]),
     )
-
-
-def _text(output: IO[bytes]) -> str:
-    output.seek(0)
-    return output.read().decode(errors="replace")

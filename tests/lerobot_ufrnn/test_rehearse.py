@@ -19,8 +19,9 @@ class Script:
         self.asked += 1
         return self.states[min(self.asked, len(self.states)) - 1]
 
-    def poll(self):
-        return 0 if self.asked >= self.ends_at else None
+    @property
+    def has_ended(self):
+        return self.asked >= self.ends_at
 
 
 def state(time, moved=0.5, opening=0.0, attempts=(), held=False, tried_while_held=()):

@@ -1,0 +1,86 @@
+"""A command of LeRobot that runs beside ours, against the robot's digital twin."""
+
+import signal
+import subprocess
+import tempfile
+from collections.abc import Sequence
+
+from env_door.twin import ports
+
+from ..experiments.processes import with_this_python
+
+FPS = 10
+"""Control frequency in Hz, of simulation, robot and policies."""
+
+END_SECONDS = 30.0
+"""How long a command may take to end after an interrupt."""
+
+
+def twin_flags(address: str) -> list[str]:
+    """The flags with which LeRobot's commands use the twin as their robot.
+
+    Args:
+        address (`str`):
+            Where the twin listens.
+
+    Returns:
+        `list[str]`: `--robot.*` flags.
+    """
+    camera = f"{{type: zmq, server_address: {address}, port: {ports.CAMERA}, camera_name: front"
+    return [
+        "--robot.type=ur5e_robotiq",
+        "--robot.id=twin",
+        f"--robot.ip={address}",
+        f"--robot.cameras={{front: {camera}, width: 640, height: 480, fps: 30}}}}",
+    ]
+
+
+class StockCommand:
+    """A command that runs for as long as a `with` block, or ends before.
+
+    Args:
+        command (`Sequence[str]`):
+            Its name, such as `lerobot-rollout`, and its flags.
+    """
+
+    def __init__(self, command: Sequence[str]):
+        self._command = command
+
+    def __enter__(self) -> "StockCommand":
+        self._output = tempfile.TemporaryFile()
+        self.process = subprocess.Popen(
+            with_this_python(self._command),
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # Ctrl-C reaches our process alone, which then ends it in order
+        )
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.stop()
+        self._output.close()
+
+    @property
+    def has_ended(self) -> bool:
+        """`bool`: whether it runs no more."""
+        return self.process.poll() is not None
+
+    def stop(self) -> None:
+        """Interrupts it, as LeRobot wants to be ended early, and waits for its end."""
+        if not self.has_ended:
+            self.process.send_signal(signal.SIGINT)
+        try:
+            self.process.wait(END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    def output(self) -> str:
+        """What it has printed so far.
+
+        Returns:
+            `str`: lines of text.
+        """
+        self._output.seek(0)
+        return self._output.read().decode(errors="replace")
