@@ -61,7 +61,7 @@ class DoorEnvConfig(EnvConfig):
         command_limit (`float`, *optional*, defaults to 0.08):
             Largest distance, in radians, of a joint command from the measured joint.
         hold_seconds (`float`, *optional*, defaults to 0.0):
-            Time in seconds for which somebody holds the door still once it has begun to open; 0 to 20.
+            Time in seconds for which somebody holds the door still once it has begun to open; 0 to 60.
         trial_log (`str | None`, *optional*):
             File that gets one JSON line for every finished trial, see [`~env_door.trials.read_trials`].
 

@@ -18,7 +18,7 @@ CONTROL_STEPS = 50
 MAX_OFFSET = 0.05
 """Largest sideways shift of the door in metres."""
 
-MAX_HOLD = 20.0
+MAX_HOLD = 60.0
 """Longest time in seconds for which somebody holds the door."""
 
 HOLD_OPENING = 0.15
@@ -57,7 +57,7 @@ class DoorEnv(gym.Env):
             Largest distance in rad between a joint target and the measured joint; keeps a blocked arm from
             folding up.
         hold_seconds (`float`, *optional*, defaults to `0.0`):
-            Seconds, 0 to 20, for which somebody on the other side holds the door still, once in a trial: from the
+            Seconds, 0 to 60, for which somebody on the other side holds the door still, once in a trial: from the
             first control step that leaves it at least 15 % open. Meanwhile `info["held"]` is true, and
             `info["tried_while_held"]` lists the ways other than its own that are tried. 0 lets the door be.
         observation_size (`int`, *optional*, defaults to `128`):

@@ -32,7 +32,7 @@ class TwinClient:
 
         Args:
             do (`str`):
-                `"state"`, `"reset"`, `"hold"`, `"fault"` or `"clear"`.
+                `"state"`, `"reset"`, `"hold"`, `"arrivals"`, `"fault"` or `"clear"`.
             parameters (`Any`):
                 Its parameters.
 
@@ -77,6 +77,14 @@ class TwinClient:
             `dict[str, Any]`: the state.
         """
         return self.request("reset", kind=kind, seed=seed, keep_arm=keep_arm)
+
+    def arrivals(self) -> list[float]:
+        """When set-points came.
+
+        Returns:
+            `list[float]`: as `env_door.twin.twin.Twin.arrivals` says.
+        """
+        return self.request("arrivals")["arrivals"]
 
     def hold(self, seconds: float) -> None:
         """Holds the door.

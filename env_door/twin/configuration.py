@@ -22,7 +22,7 @@ class TwinConfig:
         door_offset (`float`, *optional*, defaults to `0.0`):
             Half-width in m, 0 to 0.05, of the range of the door's sideways shift.
         hold_seconds (`float`, *optional*, defaults to `0.0`):
-            Seconds, 0 to 20, for which somebody holds the door once it has begun to open.
+            Seconds, 0 to 60, for which somebody holds the door once it has begun to open.
         camera (`bool`, *optional*, defaults to `True`):
             Whether there is a camera; it needs pyzmq.
         camera_fps (`float`, *optional*, defaults to `30.0`):

@@ -32,6 +32,7 @@ class ControlPeer(LinePeer):
             "state": twin.state,
             "reset": twin.reset,
             "hold": self._hold,
+            "arrivals": twin.arrivals,
             "fault": self._fault,
             "clear": self._clear,
         }

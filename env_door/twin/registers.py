@@ -1,6 +1,13 @@
 """General-purpose registers: the letter box between a client and the program that runs on the controller."""
 
+import time
+from collections import deque
+from collections.abc import Iterable
+
 from env_door.twin.rtde_variables import NUM_REGISTERS, register
+
+MAX_ARRIVALS = 100_000
+"""How many arrivals are kept, more than 13 minutes of set-points."""
 
 
 class Registers:
@@ -8,6 +15,7 @@ class Registers:
 
     Attributes:
         updated (`dict[str, float]`): Controller time in s at which an input variable was last written.
+        arrivals (`deque[float]`): Real time in s, `time.monotonic()`, at which the last data packages came.
         owners (`dict[str, object]`): Which connection writes an input variable; a second one is refused.
     """
 
@@ -17,23 +25,24 @@ class Registers:
         self.output_int = [0] * NUM_REGISTERS
         self.output_double = [0.0] * NUM_REGISTERS
         self.updated: dict[str, float] = {}
+        self.arrivals: deque[float] = deque(maxlen=MAX_ARRIVALS)
         self.owners: dict[str, object] = {}
 
-    def write_input(self, name: str, value: float, time: float) -> None:
-        """Takes one variable of a client's data package.
+    def write_inputs(self, values: Iterable[tuple[str, float]], now: float) -> None:
+        """Takes a client's data package.
 
         Args:
-            name (`str`):
-                Name of the RTDE variable; any but an input register has no effect.
-            value (`float`):
-                What was written.
-            time (`float`):
+            values (`Iterable[tuple[str, float]]`):
+                Names of RTDE variables and what was written; any but an input register has no effect.
+            now (`float`):
                 Controller time in s.
         """
-        known = register(name)
-        if known is not None:
-            getattr(self, known[0])[known[1]] = value
-            self.updated[name] = time
+        self.arrivals.append(time.monotonic())
+        for name, value in values:
+            known = register(name)
+            if known is not None:
+                getattr(self, known[0])[known[1]] = value
+                self.updated[name] = now
 
     def read(self, name: str) -> float:
         """Value of a register.

@@ -147,8 +147,8 @@ class RTDESession:
         if not body or body[0] not in self._inputs:
             raise ValueError(f"unknown input recipe {body[:1].hex() or 'none'}")
         fields, layout = self._inputs[body[0]]
-        for name, value in zip(fields, layout.unpack(body[1:]), strict=True):
-            self._controller.registers.write_input(name, value, self._controller.time)
+        values = zip(fields, layout.unpack(body[1:]), strict=True)
+        self._controller.registers.write_inputs(values, self._controller.time)
 
     def _answer(self, kind: int, body: bytes) -> None:
         self._connection.send(HEADER.pack(HEADER.size + len(body), kind) + body)

@@ -163,6 +163,17 @@ class Twin:
             "lost_seconds": self._lost,
         }
 
+    def arrivals(self) -> dict[str, Any]:
+        """When clients of RTDE wrote inputs since this was asked last: each set-point of a servo is one such package.
+
+        Returns:
+            `dict[str, Any]`: `arrivals`, real times in s in order.
+        """
+        arrivals = self.controller.registers.arrivals
+        times = list(arrivals)
+        arrivals.clear()
+        return {"arrivals": times}
+
     def close(self) -> None:
         """Ends all connections and the camera."""
         if self._camera is not None:

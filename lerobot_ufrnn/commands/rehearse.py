@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from env_door.env import MAX_HOLD
 from env_door.latch import KINDS
 from env_door.trials import Trial, append_trial, read_trials
@@ -19,6 +22,9 @@ START_SECONDS = 120.0
 """Longest time for a roll-out to load its policy and connect."""
 
 POLL_SECONDS = 0.05
+MISSED = 0.012
+"""Interval in s between set-points above which one was missed: the servo sends one every 8 ms."""
+
 SLOW = "running slower"
 """What `lerobot-rollout` warns of when a tick was late."""
 
@@ -68,20 +74,45 @@ class RehearseConfig:
 
 
 def run(arguments: list[str]) -> None:
-    """Runs the trials that the log does not have, and prints the table of all."""
+    """Runs the trials that the log does not have; prints how evenly the arm was served, and the table of all."""
     config = parse_flags(RehearseConfig, arguments)
     config.trial_log.parent.mkdir(parents=True, exist_ok=True)
     done = {(trial.door_kind, trial.seed) for trial in _logged(config.trial_log)}
+    intervals: list[NDArray[np.float64]] = []
     with TwinProcess(camera=True, hold_seconds=config.hold_seconds) as twin:
         for kind, seed in _trials(config):
             if (kind, seed) in done:
                 continue
-            trial, late = _try(config, twin, kind, seed)
+            trial, text = _try(config, twin, kind, seed)
             append_trial(config.trial_log, trial)
+            intervals.append(np.diff(twin.arrivals()))
             tried = ", ".join(trial.attempts) or "nothing"
             outcome = f"opened after {trial.steps / FPS:.1f} s" if trial.success else "not opened"
-            print(f"{kind} door, seed {seed}: {outcome}; tried {tried}; {late} late ticks", flush=True)
+            print(f"{kind} door, seed {seed}: {outcome}; tried {tried}; {text.count(SLOW)} late ticks", flush=True)
+    if intervals:
+        print(f"\n{describe_intervals(np.concatenate(intervals))}")
     print("\n" + to_markdown(summarize(_logged(config.trial_log))), end="")
+
+
+def describe_intervals(intervals: NDArray[np.float64]) -> str:
+    """How evenly set-points came.
+
+    Args:
+        intervals (`NDArray[np.float64]`):
+            Times in s from one to the next, (M,).
+
+    Returns:
+        `str`: a sentence.
+    """
+    if intervals.size == 0:
+        return "No set-points came."
+    median, high, longest = 1000 * np.quantile(intervals, [0.5, 0.99, 1.0])
+    missed = int((intervals > MISSED).sum())
+    return (
+        f"{intervals.size} set-points in {intervals.sum():.0f} s as the controller received them: one every "
+        f"{median:.2f} ms (median; 99th percentile {high:.2f} ms, longest {longest:.1f} ms), "
+        f"{missed} more than {1000 * MISSED:.0f} ms after the one before."
+    )
 
 
 def _logged(path: Path) -> list[Trial]:
@@ -94,8 +125,8 @@ def _trials(config: RehearseConfig) -> Iterator[tuple[str, int]]:
             yield kind, config.seed + number
 
 
-def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tuple[Trial, int]:
-    """One trial, and how many of its ticks were late.
+def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tuple[Trial, str]:
+    """One trial, and what the roll-out printed.
 
     Raises:
         RuntimeError: If the roll-out fails; the message has the end of its output.
@@ -107,7 +138,7 @@ def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tup
         text = rollout.output()
     if trial is None:
         raise RuntimeError(f"lerobot-rollout ended with status {rollout.process.returncode} too soon:\n{text[-2000:]}")
-    return trial, text.count(SLOW)
+    return trial, text
 
 
 def _rollout(config: RehearseConfig, address: str) -> list[str]:
@@ -131,6 +162,7 @@ def _watch(config: RehearseConfig, twin: TwinProcess, rollout: StockCommand, kin
         state = twin.state()
         if begin is None and max(abs(state["targets"][name] - value) for name, value in state["joints"].items()) > 0.01:
             begin = state["time"]
+            twin.arrivals()  # those of connecting do not count
         if begin is not None:
             steps = round((state["time"] - begin) * FPS)
             if state["held"] and held_at is None:

@@ -36,7 +36,7 @@ class ProtocolConfig:
         trial_seed (`int`, *optional*, defaults to `10000`):
             Seed of the first trial; the others count up from it, the same for every model.
         hold_seconds (`float`, *optional*, defaults to `0.0`):
-            Interference: time in seconds, 0 to 20, for which somebody holds the door of a trial still once it has begun
+            Interference: time in seconds, 0 to 60, for which somebody holds the door of a trial still once it has begun
             to open.
         variant (`str`, *optional*):
             Name of what `policy_flags` change, in the table `<model>+<variant>`.

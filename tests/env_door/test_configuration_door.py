@@ -81,8 +81,8 @@ def test_policy_features(arm, dimension):
         ("start_variation", 0.06, "0 to 0.05"),
         ("command_limit", 0.0, "0.01 to 1.0"),
         ("command_limit", 1.1, "0.01 to 1.0"),
-        ("hold_seconds", -0.1, "0 to 20.0 s"),
-        ("hold_seconds", 20.1, "0 to 20.0 s"),
+        ("hold_seconds", -0.1, "0 to 60.0 s"),
+        ("hold_seconds", 60.1, "0 to 60.0 s"),
         ("max_parallel_tasks", 2, "must be 1"),
     ],
 )

@@ -152,7 +152,7 @@ def test_bad_actions_are_refused(env, action):
         ({"door_offset": float("nan")}, "door_offset=nan"),
         ({"command_limit": 0.0}, "command_limit=0.0"),
         ({"hold_seconds": -1.0}, "hold_seconds=-1.0"),
-        ({"hold_seconds": 21.0}, "hold_seconds=21.0 is out of range; it must lie within 0.0 to 20.0 s"),
+        ({"hold_seconds": 61.0}, "hold_seconds=61.0 is out of range; it must lie within 0.0 to 60.0 s"),
         ({"render_mode": "human"}, "render_mode='human'"),
         ({"observation_size": 4}, "observation_size=4"),
     ],

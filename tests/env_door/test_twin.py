@@ -187,6 +187,15 @@ def test_upper_registers_serve_as_well(twin):
         client.disconnect()
 
 
+def test_the_twin_tells_when_set_points_came(twin, control, receive):
+    twin.arrivals()
+    assert servo(control, receive, [0.0] * 6, 0.4)
+    arrivals = np.array(twin.arrivals())
+    assert len(arrivals) == round(0.4 * RATE)
+    assert (np.diff(arrivals) >= 0).all()
+    assert twin.arrivals() == []
+
+
 def test_watchdog_stops_the_arm_when_the_client_falls_silent(twin, control, receive):
     assert control.setWatchdog(2.0)
     assert servo(control, receive, [0.1, 0, 0, 0, 0, 0], 0.5)

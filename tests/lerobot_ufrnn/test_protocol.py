@@ -382,7 +382,7 @@ def test_an_interruption_stops_the_commands(protocol, monkeypatch):
         (["--trials_per_kind=0"], "--trials_per_kind must be at least 1, got 0"),
         (["--workers=0"], "--workers must be at least 1"),
         (["--door_offset=0.5"], "--door_offset must be 0 to 0.05 m, got 0.5"),
-        (["--hold_seconds=30"], "--hold_seconds must be 0 to 20.0 s, got 30.0"),
+        (["--hold_seconds=70"], "--hold_seconds must be 0 to 60.0 s, got 70.0"),
         (["--kinds=[push,lift]"], "--kinds must be one or more of ['push', 'pull', 'slide'], each once, got ['push',"),
         (["--kinds=[push,push]"], "each once"),
         (["--kinds=[]"], "--kinds must be one or more of"),

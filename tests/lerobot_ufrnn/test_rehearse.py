@@ -1,5 +1,6 @@
 """Trials on the twin, with a twin and a roll-out that play a script."""
 
+import numpy as np
 import pytest
 
 from env_door.trials import append_trial, read_trials
@@ -18,6 +19,9 @@ class Script:
     def state(self):
         self.asked += 1
         return self.states[min(self.asked, len(self.states)) - 1]
+
+    def arrivals(self):
+        return []
 
     @property
     def has_ended(self):
@@ -65,6 +69,17 @@ def test_a_trial_begins_when_the_arm_is_commanded_to_move_and_ends_when_the_door
     assert read_trials(tmp_path / "log.jsonl") == [trial]
 
 
+def test_intervals_between_set_points_are_told_and_missed_ones_counted():
+    intervals = np.array([0.008] * 197 + [0.009, 0.013, 0.050])
+    told = rehearse.describe_intervals(intervals)
+    assert told.startswith("200 set-points in 2 s")
+    assert "one every 8.00 ms" in told
+    assert f"99th percentile {1000 * np.percentile(intervals, 99):.2f} ms" in told
+    assert "longest 50.0 ms" in told
+    assert "2 more than 12 ms after" in told
+    assert rehearse.describe_intervals(np.array([])) == "No set-points came."
+
+
 def test_a_trial_ends_with_its_time(tmp_path):
     trial = watch(Script(state(5.0), state(14.9), state(15.0), state(99.0, opening=2.0)), tmp_path, duration=10.0)
     assert not trial.success
@@ -91,7 +106,7 @@ def test_the_roll_out_is_the_stock_command_without_a_return_to_the_first_pose(tm
         ("--kinds=[up]", "--kinds must be one or more of"),
         ("--trials_per_kind=0", "at least 1"),
         ("--duration=0", "--duration must be above 0"),
-        ("--hold_seconds=99", "--hold_seconds must be 0 to 20"),
+        ("--hold_seconds=99", "--hold_seconds must be 0 to 60"),
     ],
 )
 def test_flags_out_of_range_are_refused(tmp_path, capsys, flag, message):
