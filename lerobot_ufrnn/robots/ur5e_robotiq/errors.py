@@ -38,7 +38,7 @@ REMEDIES = {
     Fault.SERVO_DIED: "the servo process ended unexpectedly; look at its output above, then connect again",
     Fault.GRIPPER_SILENT: "check the gripper's cable and its URCap, then connect again",
     Fault.GRIPPER_FAULT: "clear the gripper's fault on the pendant (its light tells which), then connect again",
-    Fault.CAMERA: "check the camera's cable, then connect again",
+    Fault.CAMERA: "look at what the camera shows and at its cable, then connect again",
 }
 """What the operator is to do."""
 

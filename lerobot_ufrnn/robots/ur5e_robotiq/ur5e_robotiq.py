@@ -17,6 +17,7 @@ from .configuration_ur5e_robotiq import FEATURES, UR5eRobotiqConfig
 from .errors import Fault, RobotFaultError
 from .gripper import Gripper
 from .limits import Limits
+from .picture_check import PictureCheck
 from .servo import Servo
 
 logger = logging.getLogger(__name__)
@@ -46,6 +47,7 @@ class UR5eRobotiq(Robot):
         self._limits = Limits(config)
         self._servo: Servo | None = None
         self._gripper: Gripper | None = None
+        self._pictures: dict[str, PictureCheck] = {}
         self._fault: RobotFaultError | None = None
         self._warned = False
 
@@ -91,6 +93,7 @@ class UR5eRobotiq(Robot):
             RobotFaultError: If one of them is not ready; nothing stays connected.
         """
         self._fault = None
+        self._pictures = {name: PictureCheck(name) for name in self.cameras}
         try:
             self._check_ready()
             for name, camera in self.cameras.items():
@@ -152,6 +155,7 @@ class UR5eRobotiq(Robot):
                     image = camera.read_latest(max_age_ms=MAX_IMAGE_AGE_MS)
                 except Exception as error:
                     raise RobotFaultError(Fault.CAMERA, f"camera '{name}' gives no image: {error}") from error
+                self._pictures[name].check(image, measured)
                 observation[name] = fit_image(image, self.config.image_size)
         return observation
 
