@@ -19,7 +19,8 @@ def draw(rows: Sequence[ProtocolRow], path: Path) -> None:
     """Draws a panel a model and writes them to `path`.
 
     The stacked areas are the doors of each kind that were opened within 30 s, as a share of all trials and pooled over
-    training seeds, so that their upper edge is the success rate. Each thin line is the success rate of one seed.
+    training seeds, so that their upper edge is the success rate. Each thin line is the success rate of one seed. Where
+    there are models with several evaluated epochs, those with a single one are left out.
 
     Args:
         rows (`Sequence[ProtocolRow]`):
@@ -30,7 +31,8 @@ def draw(rows: Sequence[ProtocolRow], path: Path) -> None:
     Raises:
         ValueError: If the table is empty.
     """
-    models = sorted({row.model for row in rows})
+    epochs = {model: {row.epoch for row in rows if row.model == model} for model in {row.model for row in rows}}
+    models = sorted(model for model in epochs if len(epochs[model]) > 1) or sorted(epochs)
     if not models:
         raise ValueError("There are no results to draw: the table is empty. `ufrnn protocol` fills it.")
     num_columns = min(len(models), PANELS_PER_ROW)

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import pytest
 
+from lerobot_ufrnn.analysis import success_curve
 from lerobot_ufrnn.analysis.evaluation_table import InterferenceRow, ProtocolRow, read_table, rows_of, to_csv
 from lerobot_ufrnn.analysis.rate_table import MINUS, interference_tables, success_tables
 from lerobot_ufrnn.analysis.results import DoorResult
@@ -97,6 +98,15 @@ def test_the_summary_pools_seeds_at_the_last_epoch_and_compares_models():
 
 def test_one_model_differs_from_none():
     assert [table.columns[0] for table in success_tables(results("ufrnn"))] == ["model", "model"]
+
+
+def test_a_single_epoch_is_no_curve_beside_others(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(success_curve, "_draw_model", lambda panel, rows: drawn.extend({row.model for row in rows}))
+    once, twice = results("once", epochs=(100,)), results("twice", epochs=(100, 200))
+    draw([*once, *twice], tmp_path / "curve.png")
+    draw(once, tmp_path / "curve.png")
+    assert drawn == ["twice", "once"]
 
 
 @pytest.mark.parametrize("epochs", [(100,), (100, 200, 500)])
