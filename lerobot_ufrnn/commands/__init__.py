@@ -17,6 +17,8 @@ COMMANDS = {
     "drift": "measure how far imagined futures drift from the demonstrations",
     "lyapunov": "draw how chaotic the imagined futures are along the demonstrations",
     "rehearse": "run trials on the digital twin of the robot, through stock lerobot-rollout",
+    "operate": "record demonstrations on the digital twin of the robot, through stock lerobot-record",
+    "faults": "make things fail while stock lerobot-record moves the twin; table of what became of it",
     "report": "put all results, tables, pictures and videos into one page",
     "benchmark": "time it against the readable code, XLA, ACT and Diffusion Policy",
 }

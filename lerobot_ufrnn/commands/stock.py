@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Sequence
 
 from env_door.twin import ports
@@ -14,6 +15,8 @@ FPS = 10
 
 END_SECONDS = 30.0
 """How long a command may take to end after an interrupt."""
+
+POLL_SECONDS = 0.02
 
 
 def twin_flags(address: str) -> list[str]:
@@ -75,6 +78,31 @@ class StockCommand:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
+
+    def wait_for(self, text: str, seconds: float) -> None:
+        """Waits until it has printed something.
+
+        Args:
+            text (`str`):
+                What to wait for.
+            seconds (`float`):
+                For how long at most.
+
+        Raises:
+            RuntimeError: If it ends without printing it, or takes longer; the message has the end of its output.
+        """
+        deadline = time.monotonic() + seconds
+        while text not in self.output():
+            if self.has_ended and text not in self.output():
+                raise RuntimeError(
+                    f"{self._command[0]} ended with status {self.process.returncode} before it printed {text!r}:\n"
+                    f"{self.output()[-2000:]}"
+                )
+            if time.monotonic() > deadline:
+                raise RuntimeError(
+                    f"{self._command[0]} did not print {text!r} within {seconds:g} s:\n{self.output()[-2000:]}"
+                )
+            time.sleep(POLL_SECONDS)
 
     def output(self) -> str:
         """What it has printed so far.

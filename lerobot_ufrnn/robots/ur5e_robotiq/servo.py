@@ -34,9 +34,12 @@ ROBOT_MODE_RUNNING = 7
 SAFETY_NORMAL, SAFETY_REDUCED = 1, 2
 STOPPED_BY_SAFETY = {3: Fault.PROTECTIVE_STOP, 6: Fault.EMERGENCY_STOP, 7: Fault.EMERGENCY_STOP}
 
-# What the servo tells.
-MEASURED, COMMANDED, FAULT = slice(0, 6), slice(6, 12), 12
-STATE_SIZE = 13
+SILENT_SECONDS = 0.5
+"""How much longer than `stale_after` nothing may be heard of the servo process; it tells of faults within that time."""
+
+# What the servo tells; the moment is that of `time.monotonic()`, which all processes have in common.
+MEASURED, COMMANDED, FAULT, MOMENT = slice(0, 6), slice(6, 12), 12, 13
+STATE_SIZE = 14
 TEXT_SIZE = 400
 
 
@@ -95,8 +98,13 @@ class Servo:
         fault = Fault(int(values[FAULT]))
         if fault is not Fault.NONE:
             return RobotFaultError(fault, self._text.value.decode(errors="replace") or "no details")
-        if self._process.pid is not None and not self._process.is_alive() and not self._stop.is_set():
+        if self._process.pid is None or self._stop.is_set():
+            return None
+        if not self._process.is_alive():
             return RobotFaultError(Fault.SERVO_DIED, f"exit code {self._process.exitcode}")
+        silent = time.monotonic() - values[MOMENT]
+        if self._ready.is_set() and silent > self._config.stale_after + SILENT_SECONDS:
+            return RobotFaultError(Fault.SERVO_LATE, f"the servo process hangs: nothing heard of it for {silent:.1f} s")
         return None
 
     def check(self) -> None:
@@ -151,7 +159,9 @@ def _run(
 ) -> None:
     """The servo process."""
     # Ctrl-C reaches every process of a terminal; what becomes of the arm is its owner's decision.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in ("SIGINT", "SIGHUP"):  # so does a terminal that is closed, where there is such a signal
+        if (number := getattr(signal, name, None)) is not None:
+            signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     values, control, link_works = np.zeros(STATE_SIZE), None, True
     try:
@@ -239,7 +249,7 @@ def _servo(
             _check(config, owner, control, receive, now, stamped)
             raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
         # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
-        values[MEASURED], values[COMMANDED] = measured, commanded
+        values[MEASURED], values[COMMANDED], values[MOMENT] = measured, commanded, time.monotonic()
         state.write(values)
         ready.set()
         due += period
@@ -249,6 +259,8 @@ def _servo(
             due = time.monotonic()
         else:
             time.sleep(-behind)
+    # The owner may have asked for the end because of what the same cause did to the gripper or a camera.
+    _check_interruption(control, receive)
 
 
 def _check(config: UR5eRobotiqConfig, owner: int, control: Any, receive: Any, now: float, stamped: float) -> None:
@@ -257,13 +269,18 @@ def _check(config: UR5eRobotiqConfig, owner: int, control: Any, receive: Any, no
         raise _StopError(Fault.LINK_LOST, f"the connection to {config.ip} broke")
     if now - stamped > config.stale_after:
         raise _StopError(Fault.STALE_DATA, f"no new data from {config.ip} for {1000 * (now - stamped):.0f} ms")
+    _check_interruption(control, receive)
+    if os.getppid() != owner:
+        raise _StopError(Fault.OWNER_GONE, "the program that commanded it ended")
+
+
+def _check_interruption(control: Any, receive: Any) -> None:
+    """Looks whether the controller carries out commands."""
     if _interruption(control, receive) is not None:
         # One cause shows in several values, which come one after the other and over two connections: nothing more is
         # commanded while the rest comes in, then the most telling one counts.
         time.sleep(SETTLE_SECONDS)
         raise _interruption(control, receive) or _StopError(Fault.PROGRAM_STOPPED, "the controller paused the program")
-    if os.getppid() != owner:
-        raise _StopError(Fault.OWNER_GONE, "the program that commanded it ended")
 
 
 def _interruption(control: Any, receive: Any) -> _StopError | None:

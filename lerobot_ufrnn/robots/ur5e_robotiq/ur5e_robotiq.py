@@ -17,6 +17,7 @@ from .configuration_ur5e_robotiq import FEATURES, UR5eRobotiqConfig
 from .errors import Fault, RobotFaultError
 from .gripper import Gripper
 from .limits import Limits
+from .orderly_end import OrderlyEnd
 from .picture_check import PictureCheck
 from .servo import Servo
 
@@ -30,7 +31,7 @@ class UR5eRobotiq(Robot):
 
     Whatever goes wrong (lost link, stale data, protective or emergency stop, stopped program, gripper fault, missing
     camera) stops the arm; `get_observation` and `send_action` then raise [`RobotFaultError`] until somebody has looked
-    and connects again.
+    and connects again. While it is connected, SIGTERM and SIGHUP end the program in order: see [`OrderlyEnd`].
 
     Args:
         config (`UR5eRobotiqConfig`):
@@ -50,6 +51,7 @@ class UR5eRobotiq(Robot):
         self._pictures: dict[str, PictureCheck] = {}
         self._fault: RobotFaultError | None = None
         self._warned = False
+        self._orderly_end = OrderlyEnd()
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
@@ -94,6 +96,7 @@ class UR5eRobotiq(Robot):
         """
         self._fault = None
         self._pictures = {name: PictureCheck(name) for name in self.cameras}
+        self._orderly_end.begin()
         try:
             self._check_ready()
             for name, camera in self.cameras.items():
@@ -203,10 +206,15 @@ class UR5eRobotiq(Robot):
         try:
             yield
         except RobotFaultError as fault:
-            self._fault = fault
             assert self._servo is not None
             self._servo.stop()
-            raise
+            cause = self._servo.fault
+            if cause is None or cause.fault is fault.fault:
+                self._fault = fault
+                raise
+            # What stops the arm can take the gripper's power, too; the servo, which asks the controller, knows better.
+            self._fault = cause
+            raise cause from fault
 
     def _release(self) -> None:
         if self._servo is not None:
@@ -219,6 +227,7 @@ class UR5eRobotiq(Robot):
             with contextlib.suppress(Exception):
                 if camera.is_connected:
                     camera.disconnect()
+        self._orderly_end.end()
 
 
 def fit_image(image: np.ndarray, size: int) -> np.ndarray:
