@@ -14,6 +14,8 @@ from env_door.twin import TwinProcess
 from lerobot_ufrnn.robots.ur5e_robotiq import Fault, RobotFaultError, UR5eRobotiq, UR5eRobotiqConfig
 from lerobot_ufrnn.robots.ur5e_robotiq import ur5e_robotiq as robot_module
 
+pytestmark = pytest.mark.real_time
+
 STILL = 0.01
 """Joint speed in rad/s below which the arm stands."""
 
