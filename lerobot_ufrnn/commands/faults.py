@@ -155,6 +155,8 @@ def _record(address: str, events: Path, dataset: Path) -> list[str]:
         "--dataset.reset_time_s=0",
         "--dataset.num_episodes=2",
         "--dataset.push_to_hub=false",
+        # As root LeRobot's default encoder would give the whole program real-time priority, over the servo's head.
+        "--dataset.rgb_encoder.vcodec=h264",
         "--play_sounds=false",
         "--display_data=false",
     ]
