@@ -9,6 +9,7 @@ Three rules make the doors indistinguishable until somebody tries them:
    0.2 s. The load is the force with which the lock's constraint holds the panel against the robot.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -22,6 +23,20 @@ UNLATCH_ANGLE = 0.7
 
 LOAD_STEPS = 100
 """Physics steps (of 2 ms) for which a load must last: a robot that trembles tries nothing, one that pushes does."""
+
+
+def check_kinds(kinds: Sequence[str]) -> None:
+    """Looks whether the flag `--kinds` of a command names kinds of door, each once.
+
+    Args:
+        kinds (`Sequence[str]`):
+            Its value.
+
+    Raises:
+        ValueError: If it does not; says what is allowed.
+    """
+    if not kinds or sorted(kinds) != sorted(set(kinds) & set(KINDS)):
+        raise ValueError(f"--kinds must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
 
 
 @dataclass(frozen=True)

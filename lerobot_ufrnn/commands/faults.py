@@ -18,7 +18,7 @@ from ..experiments.state import replace_text
 from .flags import parse_flags
 from .injection import FAULTS, RELEASE_SECONDS, Fault, Victim
 from .recorded import readable_episodes
-from .stock import FPS, StockCommand, twin_flags
+from .stock import StockCommand, record_command
 
 EPISODE_SECONDS = 6
 """Length of an episode: the fault strikes early in the second, so that going on can be told from its end."""
@@ -142,22 +142,11 @@ def _movement() -> str:
 
 def _record(address: str, events: Path, dataset: Path) -> list[str]:
     return [
-        "lerobot-record",
-        *twin_flags(address),
-        "--teleop.type=spacemouse_twist",
-        f"--teleop.robot_ip={address}",
-        f"--teleop.device={events}",
-        "--dataset.repo_id=me/faults",
-        f"--dataset.root={dataset}",
+        *record_command(address, events, "me/faults", dataset, EPISODE_SECONDS, num_episodes=2),
         "--dataset.single_task=move",
-        f"--dataset.fps={FPS}",
-        f"--dataset.episode_time_s={EPISODE_SECONDS}",
         "--dataset.reset_time_s=0",
-        "--dataset.num_episodes=2",
-        "--dataset.push_to_hub=false",
         # As root LeRobot's default encoder would give the whole program real-time priority, over the servo's head.
         "--dataset.rgb_encoder.vcodec=h264",
-        "--play_sounds=false",
         "--display_data=false",
     ]
 

@@ -24,7 +24,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from env_door.demonstration import TIMING_STREAM
 from env_door.expert import DoorExpert
 from env_door.kinematics import UnreachableError
-from env_door.latch import KINDS
+from env_door.latch import KINDS, check_kinds
 from env_door.recording import CAMERA
 from env_door.recording_config import FrameEncoderConfig
 from env_door.staging import StagedDirectory
@@ -34,16 +34,13 @@ from env_door.twin.live_door import LiveDoor
 from ..teleoperators import SpaceMouseTwistConfig
 from ..teleoperators.scripted_operator import Event, ToolPath, duration, events_along, write_events
 from .flags import parse_flags
-from .stock import FPS, StockCommand, twin_flags
+from .stock import FPS, StockCommand, late_ticks, record_command
 
 LEDGER = Path("meta/door_operation.json")
 """In the data set: kind and seed of each episode."""
 
 START_SECONDS = 120.0
 """Longest time for LeRobot to start, connect and save."""
-
-SLOW = "running slower"
-"""What `lerobot-record` warns of when a tick was late."""
 
 
 class AttemptError(RuntimeError):
@@ -88,8 +85,7 @@ class OperateConfig:
             raise ValueError(f"--repo_id must read {{hf_username}}/{{dataset_name}}, got {self.repo_id!r}.")
         if self.repo_id.split("/")[1].startswith("eval_"):
             raise ValueError(f"--repo_id: LeRobot keeps names with 'eval_' for evaluations, got {self.repo_id!r}.")
-        if not self.kinds or not set(self.kinds) <= set(KINDS) or len(set(self.kinds)) < len(self.kinds):
-            raise ValueError(f"--kinds must be one or more of {list(KINDS)}, each once, got {list(self.kinds)}.")
+        check_kinds(self.kinds)
         for name, least in (("episodes_per_kind", 1), ("seed", 0), ("attempts", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} must be at least {least}, got {getattr(self, name)}.")
@@ -223,7 +219,7 @@ def _operate(
             state = twin.state()
             command.stop()
             text, status = command.output(), command.process.returncode
-    delays = f"{text.count(SLOW)} late ticks, {state['lost_seconds'] - before['lost_seconds']:.1f} s lost by the twin"
+    delays = f"{late_ticks(text)} late ticks, {state['lost_seconds'] - before['lost_seconds']:.1f} s lost by the twin"
     if status != 0:
         raise AttemptError(f"lerobot-record ended with status {status}: {text.strip().rpartition('\n')[2]}")
     if not state["is_open"]:
@@ -237,26 +233,15 @@ def _command(config: OperateConfig, address: str, root: Path, script: Path) -> l
     # As in the simulation: frames keep the full resolution of colours and no trace of later ones.
     encoder = asdict(FrameEncoderConfig())
     return [
-        "lerobot-record",
-        *twin_flags(address),
-        "--teleop.type=spacemouse_twist",
+        *record_command(address, script, config.repo_id, root, config.episode_seconds, num_episodes=1),
         "--teleop.id=script",
-        f"--teleop.robot_ip={address}",
-        f"--teleop.device={script}",
-        f"--dataset.repo_id={config.repo_id}",
-        f"--dataset.root={root}",
         "--dataset.single_task=open the door",
-        f"--dataset.fps={FPS}",
-        f"--dataset.episode_time_s={config.episode_seconds:g}",
-        "--dataset.num_episodes=1",
-        "--dataset.push_to_hub=false",
         "--dataset.no_stamp=true",
         "--dataset.streaming_encoding=true",
         "--dataset.encoder_threads=1",
         # A full queue drops frames; this one holds the episode.
         f"--dataset.encoder_queue_maxsize={round(config.episode_seconds * FPS) + 1}",
         *(f"--dataset.rgb_encoder.{name}={json.dumps(value)}" for name, value in encoder.items()),
-        "--play_sounds=false",
         f"--resume={str(root.exists()).lower()}",
     ]
 

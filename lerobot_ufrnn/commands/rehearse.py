@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from env_door.env import MAX_HOLD
-from env_door.latch import KINDS
+from env_door.latch import KINDS, check_kinds
 from env_door.trials import Trial, append_trial, read_trials
 from env_door.twin import TwinProcess
 
 from ..analysis.results import summarize, to_markdown
 from .flags import parse_flags
-from .stock import FPS, StockCommand, twin_flags
+from .stock import FPS, StockCommand, late_ticks, twin_flags
 
 START_SECONDS = 120.0
 """Longest time for a roll-out to load its policy and connect."""
@@ -24,9 +24,6 @@ START_SECONDS = 120.0
 POLL_SECONDS = 0.05
 MISSED = 0.012
 """Interval in s between set-points above which one was missed: the servo sends one every 8 ms."""
-
-SLOW = "running slower"
-"""What `lerobot-rollout` warns of when a tick was late."""
 
 
 @dataclass
@@ -63,8 +60,7 @@ class RehearseConfig:
     hold_seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.kinds or not set(self.kinds) <= set(KINDS):
-            raise ValueError(f"--kinds must be one or more of {list(KINDS)}, got {list(self.kinds)}.")
+        check_kinds(self.kinds)
         if self.trials_per_kind < 1 or self.seed < 0:
             raise ValueError("--trials_per_kind must be at least 1 and --seed at least 0.")
         if not 0 < self.duration <= 3600:
@@ -88,7 +84,7 @@ def run(arguments: list[str]) -> None:
             intervals.append(np.diff(twin.arrivals()))
             tried = ", ".join(trial.attempts) or "nothing"
             outcome = f"opened after {trial.steps / FPS:.1f} s" if trial.success else "not opened"
-            print(f"{kind} door, seed {seed}: {outcome}; tried {tried}; {text.count(SLOW)} late ticks", flush=True)
+            print(f"{kind} door, seed {seed}: {outcome}; tried {tried}; {late_ticks(text)} late ticks", flush=True)
     if intervals:
         print(f"\n{describe_intervals(np.concatenate(intervals))}")
     print("\n" + to_markdown(summarize(_logged(config.trial_log))), end="")

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.wrappers import RenderCollection
 from numpy.typing import NDArray
 
-from env_door.latch import KINDS
+from env_door.latch import KINDS, check_kinds
 
 from ..analysis import report_sections
 from ..analysis.foresight_picture import draw_strip
@@ -68,8 +68,7 @@ class ReportConfig:
     num_steps: int = 300
 
     def __post_init__(self) -> None:
-        if not self.kinds or not set(self.kinds) <= set(KINDS) or len(set(self.kinds)) != len(self.kinds):
-            raise ValueError(f"--kinds must be one or more of {list(KINDS)}, each once, got {self.kinds}.")
+        check_kinds(self.kinds)
         for name in ("trials_per_kind", "num_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}.")

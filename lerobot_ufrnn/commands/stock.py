@@ -5,6 +5,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 from env_door.twin import ports
 
@@ -36,6 +37,57 @@ def twin_flags(address: str) -> list[str]:
         f"--robot.ip={address}",
         f"--robot.cameras={{front: {camera}, width: 640, height: 480, fps: 30}}}}",
     ]
+
+
+def record_command(
+    address: str, events: Path, repo_id: str, root: Path, episode_seconds: float, num_episodes: int
+) -> list[str]:
+    """The part of `lerobot-record` that all recordings of played events on the twin have in common.
+
+    Args:
+        address (`str`):
+            Where the twin listens.
+        events (`Path`):
+            Events to play, see [`~lerobot_ufrnn.teleoperators.event_stream`].
+        repo_id (`str`):
+            Name of the data set; nothing is uploaded.
+        root (`Path`):
+            Its folder.
+        episode_seconds (`float`):
+            Length of an episode in s.
+        num_episodes (`int`):
+            Number of episodes.
+
+    Returns:
+        `list[str]`: the command with its first flags.
+    """
+    return [
+        "lerobot-record",
+        *twin_flags(address),
+        "--teleop.type=spacemouse_twist",
+        f"--teleop.robot_ip={address}",
+        f"--teleop.device={events}",
+        f"--dataset.repo_id={repo_id}",
+        f"--dataset.root={root}",
+        f"--dataset.fps={FPS}",
+        f"--dataset.episode_time_s={episode_seconds:g}",
+        f"--dataset.num_episodes={num_episodes}",
+        "--dataset.push_to_hub=false",
+        "--play_sounds=false",
+    ]
+
+
+def late_ticks(output: str) -> int:
+    """How often a control loop of LeRobot warned that it is late.
+
+    Args:
+        output (`str`):
+            What the command printed.
+
+    Returns:
+        `int`: the number.
+    """
+    return output.count("running slower")
 
 
 class StockCommand:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from env_door.env import MAX_HOLD, MAX_OFFSET
-from env_door.latch import KINDS
+from env_door.latch import KINDS, check_kinds
 
 from ..analysis.evaluation_table import EvaluationRow, InterferenceRow, ProtocolRow
 
@@ -113,8 +113,7 @@ class ProtocolConfig:
         ):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} must be at least {least}, got {getattr(self, name)}.")
-        if not self.kinds or sorted(self.kinds) != sorted(set(self.kinds) & set(KINDS)):
-            raise ValueError(f"--kinds must be one or more of {list(KINDS)}, each once, got {list(self.kinds)}.")
+        check_kinds(self.kinds)
         if bool(self.variant) != bool(self.policy_flags) or not set(self.variant) <= NAME_CHARACTERS:
             raise ValueError(
                 "--variant must name --policy_flags in letters, digits, '_' and '-', and neither goes without the "
