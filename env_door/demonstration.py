@@ -1,5 +1,6 @@
 """One run of the scripted expert, kept in memory."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ from env_door.env import DoorEnv
 from env_door.expert import DoorExpert
 from env_door.kinematics import UnreachableError
 
+GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 TIMING_STREAM = 1  # keeps the expert's random numbers apart from those of the environment
 
 
@@ -41,10 +43,27 @@ class Demonstration:
     success_step: int
 
 
+def spread(seed: int) -> float:
+    """Where in its range the door stands in a demonstration.
+
+    A few random positions leave gaps, in which a policy has seen nothing; who demonstrates spreads them. Successive
+    seeds, from any one on, fall far from each other (the golden-ratio sequence, of low discrepancy).
+
+    Args:
+        seed (`int`):
+            Seed of the demonstration.
+
+    Returns:
+        `float`: from -1, the lower end of the range, to 1.
+    """
+    return 2 * ((0.5 + seed * GOLDEN_RATIO) % 1) - 1
+
+
 def demonstrate(env: DoorEnv, kind: str, seed: int, num_steps: int) -> Demonstration | None:
     """Let the expert open a door, and go on holding it open to the last step.
 
-    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`.
+    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`. The
+    door's position is no draw of the environment but [`spread`] over its range.
 
     Args:
         env (`DoorEnv`):
@@ -62,7 +81,7 @@ def demonstrate(env: DoorEnv, kind: str, seed: int, num_steps: int) -> Demonstra
     Raises:
         ValueError: If `num_steps` ends before the expert would have tried the door.
     """
-    observation, _ = env.reset(seed=seed, options={"kind": kind})
+    observation, _ = env.reset(seed=seed, options={"kind": kind, "door_offset": spread(seed) * env.door_offset})
     expert = DoorExpert(env, directions=(kind,))
     try:
         expert.reset(np.random.default_rng([seed, TIMING_STREAM]))

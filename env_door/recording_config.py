@@ -49,7 +49,7 @@ class RecordConfig:
         arm (`str`, *optional*, defaults to `"ur5e"`):
             `"ur5e"` or `"panda"`.
         door_offset (`float`, *optional*, defaults to 0.0):
-            Half-width, in metres, of the range from which the lateral shift of the door is drawn; 0 to 0.05.
+            Half-width, in metres, of the range over which the lateral shift of the door is spread evenly; 0 to 0.05.
         seed (`int`, *optional*, defaults to 0):
             First seed; the following episodes count up from it.
         matched (`bool`, *optional*, defaults to `True`):

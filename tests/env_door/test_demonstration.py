@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from env_door import demonstration
-from env_door.demonstration import demonstrate
+from env_door.demonstration import demonstrate, spread
 from env_door.env import DoorEnv
 from env_door.kinematics import UnreachableError
 from env_door.latch import KINDS
@@ -30,12 +32,27 @@ def test_nothing_before_the_branch_tells_the_kind(env, seed):
 
 def test_frames_hold_what_was_seen_and_what_was_done_then(env):
     run = demonstrate(env, "pull", 3, 100)
-    observation, _ = env.reset(seed=3, options={"kind": "pull"})
+    observation, _ = env.reset(seed=3, options={"kind": "pull", "door_offset": 0.05 * spread(3)})
     for step in range(run.success_step + 1):
         np.testing.assert_array_equal(run.states[step], observation["agent_pos"])
         np.testing.assert_array_equal(run.images[step], observation["pixels"]["front"])
         observation, _, terminated, _, _ = env.step(run.actions[step])
         assert terminated == (step == run.success_step)
+
+
+@given(st.integers(0, 2**32), st.integers(3, 60))
+def test_successive_seeds_spread_the_door_over_its_range(first, number):
+    positions = np.sort([spread(seed) for seed in range(first, first + number)])
+    gaps = np.diff(np.concatenate([[-1.0], positions, [1.0]]))
+    assert gaps.min() >= 0
+    # Evenly placed, they would be 2 / number apart. As many random ones leave a gap of about log(number) times that.
+    assert gaps.max() < 2 * 2 / number
+
+
+def test_the_door_stands_where_its_seed_spreads_it(env):
+    for seed in (0, 3):
+        demonstrate(env, "push", seed, 100)
+        assert env.current_offset == pytest.approx(0.05 * spread(seed))
 
 
 def test_seeds_differ_in_start_and_timing(env):
