@@ -3,7 +3,6 @@
 import contextlib
 import json
 import math
-import re
 import tempfile
 import time
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from ..experiments.state import replace_text
 from .flags import parse_flags
 from .injection import FAULTS, RELEASE_SECONDS, Fault, Victim
 from .recorded import readable_episodes
-from .stock import StockCommand, record_command
+from .stock import StockCommand, last_error, record_command
 
 EPISODE_SECONDS = 6
 """Length of an episode: the fault strikes early in the second, so that going on can be told from its end."""
@@ -198,7 +197,7 @@ def _watch(name: str, fault: Fault, victim: Victim, samples: list[Sample], datas
     cleared = [_look(twin)]
     while cleared[-1].time - cleared[0].time < WATCH_SECONDS:
         cleared.append(_look(twin))
-    told = _told(command.output())
+    told = last_error(command.output())
     return Outcome(
         fault=name,
         must_stop=fault.must_stop,
@@ -242,11 +241,3 @@ def _left_running(children: list[psutil.Process]) -> tuple[str, ...]:
             if child.status() != psutil.STATUS_ZOMBIE:
                 found.append(child.name())
     return tuple(found)
-
-
-def _told(output: str) -> str:
-    """The last thing that a command told its user about its end, without what to do about it."""
-    errors = re.findall(
-        r"^(?:\w+\.)*(\w+(?:Error|Exception|Interrupt)\b.*)|(Ending, as asked for by \w+)", output, re.M
-    )
-    return "".join(errors[-1]).split(". To go on:")[0].strip() if errors else ""

@@ -16,7 +16,7 @@ from env_door.twin import TwinProcess
 
 from ..analysis.results import summarize, to_markdown
 from .flags import parse_flags
-from .stock import FPS, StockCommand, late_ticks, twin_flags
+from .stock import FPS, StockCommand, last_error, late_ticks, twin_flags
 
 START_SECONDS = 120.0
 """Longest time for a roll-out to load its policy and connect."""
@@ -79,12 +79,12 @@ def run(arguments: list[str]) -> None:
         for kind, seed in _trials(config):
             if (kind, seed) in done:
                 continue
-            trial, text = _try(config, twin, kind, seed)
+            trial, told = _try(config, twin, kind, seed)
             append_trial(config.trial_log, trial)
             intervals.append(np.diff(twin.arrivals()))
             tried = ", ".join(trial.attempts) or "nothing"
-            outcome = f"opened after {trial.steps / FPS:.1f} s" if trial.success else "not opened"
-            print(f"{kind} door, seed {seed}: {outcome}; tried {tried}; {late_ticks(text)} late ticks", flush=True)
+            outcome = f"{'opened' if trial.success else 'not opened'} after {trial.steps / FPS:.1f} s"
+            print(f"{kind} door, seed {seed}: {outcome}; tried {tried}; {told}", flush=True)
     if intervals:
         print(f"\n{describe_intervals(np.concatenate(intervals))}")
     print("\n" + to_markdown(summarize(_logged(config.trial_log))), end="")
@@ -122,7 +122,7 @@ def _trials(config: RehearseConfig) -> Iterator[tuple[str, int]]:
 
 
 def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tuple[Trial, str]:
-    """One trial, and what the roll-out printed.
+    """One trial, and what else there is to tell of its roll-out. One that fails on the way is a trial, too.
 
     Raises:
         RuntimeError: If the roll-out fails; the message has the end of its output.
@@ -130,11 +130,13 @@ def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tup
     twin.reset(kind, seed)
     with StockCommand(_rollout(config, twin.address)) as rollout:
         trial = _watch(config, twin, rollout, kind, seed)
+        failed = rollout.has_ended and rollout.process.returncode != 0
         rollout.stop()
-        text = rollout.output()
+        text, status = rollout.output(), rollout.process.returncode
     if trial is None:
-        raise RuntimeError(f"lerobot-rollout ended with status {rollout.process.returncode} too soon:\n{text[-2000:]}")
-    return trial, text
+        raise RuntimeError(f"lerobot-rollout ended with status {status} before it moved the arm:\n{text[-2000:]}")
+    told = f"{late_ticks(text)} late ticks"
+    return trial, f"{told}; the roll-out failed: {last_error(text)}" if failed else told
 
 
 def _rollout(config: RehearseConfig, address: str) -> list[str]:

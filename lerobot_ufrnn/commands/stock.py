@@ -1,5 +1,6 @@
 """A command of LeRobot that runs beside ours, against the robot's digital twin."""
 
+import re
 import signal
 import subprocess
 import tempfile
@@ -88,6 +89,22 @@ def late_ticks(output: str) -> int:
         `int`: the number.
     """
     return output.count("running slower")
+
+
+def last_error(output: str) -> str:
+    """The last thing that a command told its user about its end, without what to do about it.
+
+    Args:
+        output (`str`):
+            What the command printed.
+
+    Returns:
+        `str`: an error with its name, or what asked the command to end; empty if there is neither.
+    """
+    errors = re.findall(
+        r"^(?:\w+\.)*(\w+(?:Error|Exception|Interrupt)\b.*)|(Ending, as asked for by \w+)", output, re.M
+    )
+    return "".join(errors[-1]).split(". To go on:")[0].strip() if errors else ""
 
 
 class StockCommand:

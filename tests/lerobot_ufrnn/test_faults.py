@@ -17,7 +17,7 @@ from lerobot_ufrnn.analysis.fault_table import Outcome, Sample, moves_again, sta
 from lerobot_ufrnn.commands import faults, main
 from lerobot_ufrnn.commands.injection import FAULTS
 from lerobot_ufrnn.commands.recorded import readable_episodes
-from lerobot_ufrnn.commands.stock import StockCommand
+from lerobot_ufrnn.commands.stock import StockCommand, last_error
 from lerobot_ufrnn.robots.ur5e_robotiq.orderly_end import OrderlyEnd
 
 # ── Speeds ────────────────────────────────────────────────────────────
@@ -291,11 +291,11 @@ During handling of the above exception, another exception occurred:
 lerobot_ufrnn.robots.errors.RobotFaultError: The arm was stopped (freeze): no data. To go on: look at it.
 INFO 2025-01-01 errors.py:12 Exiting
 """
-    assert faults._told(output) == "RobotFaultError: The arm was stopped (freeze): no data"
-    assert faults._told("INFO all is well\nKeyboardInterrupt\n") == "KeyboardInterrupt"
-    assert faults._told("INFO no Error in here\n") == ""
+    assert last_error(output) == "RobotFaultError: The arm was stopped (freeze): no data"
+    assert last_error("INFO all is well\nKeyboardInterrupt\n") == "KeyboardInterrupt"
+    assert last_error("INFO no Error in here\n") == ""
     ending = "WARNING 2025-01-01 orderly_end.py:12 Ending, as asked for by SIGHUP: what is open is closed first.\n"
-    assert faults._told(ending + "INFO 2025-01-01 Exiting\n") == "Ending, as asked for by SIGHUP"
+    assert last_error(ending + "INFO 2025-01-01 Exiting\n") == "Ending, as asked for by SIGHUP"
 
 
 def test_a_command_that_ends_without_saying_so_is_told(monkeypatch):

@@ -1,5 +1,7 @@
 """Trials on the twin, with a twin and a roll-out that play a script."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,9 @@ class Script:
 
     def arrivals(self):
         return []
+
+    def reset(self, kind, seed):
+        pass
 
     @property
     def has_ended(self):
@@ -90,6 +95,17 @@ def test_a_roll_out_that_ends_before_it_moves_is_no_trial_and_one_that_ends_late
     assert watch(Script(state(1.0, moved=0.0), ends_at=3), tmp_path) is None
     trial = watch(Script(state(1.0), state(2.0), ends_at=2), tmp_path)
     assert (trial.success, trial.steps) == (False, 10)
+
+
+def test_a_roll_out_that_fails_on_the_way_is_a_trial_and_its_error_is_told(tmp_path, monkeypatch):
+    code = "print('running slower'); raise RuntimeError('The arm was stopped')"
+    monkeypatch.setattr("lerobot_ufrnn.commands.stock.with_this_python", lambda command: command)
+    monkeypatch.setattr(rehearse, "_rollout", lambda *_: [sys.executable, "-c", code])
+    monkeypatch.setattr(rehearse, "POLL_SECONDS", 0.01)
+    config = RehearseConfig("checkpoint", tmp_path / "trials.jsonl", duration=3000.0)
+    trial, told = rehearse._try(config, Script(state(1.0), state(4.0)), "pull", 7)
+    assert (trial.success, trial.steps) == (False, 30)
+    assert told == "1 late ticks; the roll-out failed: RuntimeError: The arm was stopped"
 
 
 def test_the_roll_out_is_the_stock_command_without_a_return_to_the_first_pose(tmp_path):

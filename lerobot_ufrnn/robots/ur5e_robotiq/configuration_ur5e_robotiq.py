@@ -68,10 +68,13 @@ class UR5eRobotiqConfig(RobotConfig):
             Seconds between two actions; the arm moves to each in that time along a straight line in joint space.
         servo_frequency (`float`, *optional*, defaults to `125.0`):
             Set-points a second that are sent to the controller.
-        servo_lookahead (`float`, *optional*, defaults to `0.05`):
-            Seconds over which the controller smooths them, 0.03 to 0.2; by as much the arm trails a moving target.
-        servo_gain (`float`, *optional*, defaults to `600.0`):
+        servo_lookahead (`float`, *optional*, defaults to `0.1`):
+            Seconds over which the controller smooths them, 0.03 to 0.2; by as much the arm trails moving set-points.
+        servo_gain (`float`, *optional*, defaults to `300.0`):
             Its proportional gain, 100 to 2000.
+        servo_lead (`float`, *optional*, defaults to `0.1`):
+            Seconds, 0 to 0.2, by which set-points run ahead of the line to the target, so that the arm does not trail
+            it. If the arm runs past targets, this is too much.
         joint_speed (`float`, *optional*, defaults to `1.0`):
             Largest joint speed in rad/s. The arm could do 3.14.
         command_limit (`float`, *optional*, defaults to `0.08`):
@@ -89,8 +92,9 @@ class UR5eRobotiqConfig(RobotConfig):
             until then the arm goes no further than to the last set-point.
         gripper_port (`int`, *optional*, defaults to `63352`):
             Port of the gripper's socket on the controller; 0 if there is no gripper, which then reads as open.
-        gripper_force (`float`, *optional*, defaults to `0.2`):
-            Fraction of the gripper's largest force, 0 to 1.
+        gripper_force (`float`, *optional*, defaults to `0.56`):
+            How hard it squeezes, from 0, 20 N, to 1, 235 N; by default as hard as the simulated gripper, 140 N. At 0.2
+            it slips on the knob of a door that does not give way, which no demonstration in simulation shows.
         gripper_speed (`float`, *optional*, defaults to `1.0`):
             Fraction of its largest speed, 0 to 1.
         gripper_range (`tuple[int, int]`, *optional*, defaults to `(3, 230)`):
@@ -105,8 +109,9 @@ class UR5eRobotiqConfig(RobotConfig):
     image_size: int = 128
     control_period: float = 0.1
     servo_frequency: float = 125.0
-    servo_lookahead: float = 0.05
-    servo_gain: float = 600.0
+    servo_lookahead: float = 0.1
+    servo_gain: float = 300.0
+    servo_lead: float = 0.1
     joint_speed: float = 1.0
     command_limit: float = 0.08
     joint_low: tuple[float, ...] = (-JOINT_RANGE, -JOINT_RANGE, -ELBOW_RANGE, *(-JOINT_RANGE,) * 3)
@@ -116,7 +121,7 @@ class UR5eRobotiqConfig(RobotConfig):
     stale_after: float = 0.2
     watchdog_frequency: float = 4.0
     gripper_port: int = 63352
-    gripper_force: float = 0.2
+    gripper_force: float = 0.56
     gripper_speed: float = 1.0
     gripper_range: tuple[int, int] = (3, 230)
 
@@ -129,6 +134,7 @@ class UR5eRobotiqConfig(RobotConfig):
             ("servo_frequency", 50.0, 500.0),
             ("servo_lookahead", 0.03, 0.2),
             ("servo_gain", 100.0, 2000.0),
+            ("servo_lead", 0.0, 0.2),
             ("joint_speed", 0.01, 3.14),
             ("command_limit", 0.005, 0.5),
             ("stale_after", 0.02, 1.0),
