@@ -141,32 +141,11 @@ def _draw_model(panel: Axes, model: HiddenPaths) -> None:
         )
     if model.success:
         panel.plot(*model.trial[-1], marker="*", markersize=13, markerfacecolor="white", markeredgecolor="black")
-    if model.attempts:
-        _annotate_first_try(panel, model)
     result = f"opened at step {len(model.trial) - 1}" if model.success else "not opened"
-    panel.set_title(f"{model.label}\n{model.door_kind} door, {result}", fontsize=9)
+    first_try = "first try {1} at step {0}".format(*model.attempts[0]) if model.attempts else "no try"
+    panel.set_title(f"{model.label}\n{model.door_kind} door: {first_try},\n{result}", fontsize=9)
     first, second = model.shares
     panel.set(xlabel=f"PC 1 ({first:.0%})", ylabel=f"PC 2 ({second:.0%})")
-
-
-def _annotate_first_try(panel: Axes, model: HiddenPaths) -> None:
-    """Writes direction and step of the first try into the corner with the fewest points."""
-    step, direction = model.attempts[0]
-    points = panel.transAxes.inverted().transform(
-        panel.transData.transform(np.concatenate([*model.demonstrations, model.trial]))
-    )
-    corners = [(x, y) for x in (0, 1) for y in (0, 1)]
-    corner = min(corners, key=lambda corner: np.sum((np.abs(points - corner) < (0.4, 0.2)).all(axis=1)))
-    panel.annotate(
-        f"first try: {direction},\nstep {step}",
-        model.trial[step],
-        xytext=(0.02 + 0.96 * corner[0], 0.02 + 0.96 * corner[1]),
-        textcoords="axes fraction",
-        ha=("left", "right")[corner[0]],
-        va=("bottom", "top")[corner[1]],
-        fontsize=8,
-        arrowprops={"arrowstyle": "-", "linewidth": 0.6},
-    )
 
 
 def _directions(model: HiddenPaths) -> list[str]:
