@@ -131,7 +131,6 @@ def test_the_flange_is_where_the_simulated_arm_has_it(seed):
         ("joint_speed", 4.0),
         ("servo_gain", 50.0),
         ("servo_lookahead", 0.5),
-        ("servo_lead", -0.1),
         ("stale_after", float("nan")),
         ("joint_low", (0.0,) * 5),
         ("joint_low", (7.0,) * 6),

@@ -68,13 +68,11 @@ class UR5eRobotiqConfig(RobotConfig):
             Seconds between two actions; the arm moves to each in that time along a straight line in joint space.
         servo_frequency (`float`, *optional*, defaults to `125.0`):
             Set-points a second that are sent to the controller.
-        servo_lookahead (`float`, *optional*, defaults to `0.1`):
-            Seconds over which the controller smooths them, 0.03 to 0.2; by as much the arm trails moving set-points.
-        servo_gain (`float`, *optional*, defaults to `300.0`):
+        servo_lookahead (`float`, *optional*, defaults to `0.05`):
+            Seconds over which the controller smooths them, 0.03 to 0.2; by as much the arm trails a moving target,
+            which a policy from simulation has not learned.
+        servo_gain (`float`, *optional*, defaults to `600.0`):
             Its proportional gain, 100 to 2000.
-        servo_lead (`float`, *optional*, defaults to `0.1`):
-            Seconds, 0 to 0.2, by which set-points run ahead of the line to the target, so that the arm does not trail
-            it. If the arm runs past targets, this is too much.
         joint_speed (`float`, *optional*, defaults to `1.0`):
             Largest joint speed in rad/s. The arm could do 3.14.
         command_limit (`float`, *optional*, defaults to `0.08`):
@@ -109,9 +107,8 @@ class UR5eRobotiqConfig(RobotConfig):
     image_size: int = 128
     control_period: float = 0.1
     servo_frequency: float = 125.0
-    servo_lookahead: float = 0.1
-    servo_gain: float = 300.0
-    servo_lead: float = 0.1
+    servo_lookahead: float = 0.05
+    servo_gain: float = 600.0
     joint_speed: float = 1.0
     command_limit: float = 0.08
     joint_low: tuple[float, ...] = (-JOINT_RANGE, -JOINT_RANGE, -ELBOW_RANGE, *(-JOINT_RANGE,) * 3)
@@ -134,7 +131,6 @@ class UR5eRobotiqConfig(RobotConfig):
             ("servo_frequency", 50.0, 500.0),
             ("servo_lookahead", 0.03, 0.2),
             ("servo_gain", 100.0, 2000.0),
-            ("servo_lead", 0.0, 0.2),
             ("joint_speed", 0.01, 3.14),
             ("command_limit", 0.005, 0.5),
             ("stale_after", 0.02, 1.0),

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .approach import Approach
 from .client import import_client
 from .configuration_ur5e_robotiq import UR5eRobotiqConfig
 from .errors import Fault, RobotFaultError
@@ -223,7 +222,9 @@ def _servo(
     values: NDArray[np.float64],
 ) -> None:
     period = 1.0 / config.servo_frequency
-    approach, seen = Approach(np.array(receive.getActualQ()), config), targets.read()[0]
+    commanded = np.array(receive.getActualQ())
+    begin = end = commanded
+    began, seen = time.monotonic(), targets.read()[0]
     stamp, stamped = receive.getTimestamp(), time.monotonic()
     due = time.monotonic()
     while not stop.is_set():
@@ -232,13 +233,15 @@ def _servo(
             stamp, stamped = newest, now
         _check(config, owner, control, receive, now, stamped)
         count, target = targets.read()
-        measured = np.array(receive.getActualQ())
         if count != seen:
-            seen = count
-            approach.aim(target, measured, now)
-        set_point = approach.set_point(measured, now)
+            seen, begin, end, began = count, commanded, target, now
+        progress = min((now - began) / config.control_period, 1.0)
+        measured = np.array(receive.getActualQ())
+        wanted = begin + (end - begin) * progress
+        # A blocked arm must not be leant against harder than agreed, however far it is pushed back between targets.
+        commanded = np.clip(wanted, measured - config.command_limit, measured + config.command_limit)
         try:
-            taken = control.servoJ(set_point.tolist(), 0.0, 0.0, period, config.servo_lookahead, config.servo_gain)
+            taken = control.servoJ(commanded.tolist(), 0.0, 0.0, period, config.servo_lookahead, config.servo_gain)
         except RuntimeError as error:  # the client found the link broken and tried in vain to mend it
             raise _StopError(Fault.LINK_LOST, str(error)) from error
         if not taken:
@@ -246,7 +249,7 @@ def _servo(
             _check(config, owner, control, receive, now, stamped)
             raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
         # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
-        values[MEASURED], values[COMMANDED], values[MOMENT] = measured, approach.position, time.monotonic()
+        values[MEASURED], values[COMMANDED], values[MOMENT] = measured, commanded, time.monotonic()
         state.write(values)
         ready.set()
         due += period
