@@ -44,10 +44,10 @@ class Demonstration:
 
 
 def spread(seed: int) -> float:
-    """Where in its range the door stands in a demonstration.
+    """Where in its range a door may stand, so that a few demonstrations cover the range.
 
-    A few random positions leave gaps, in which a policy has seen nothing; who demonstrates spreads them. Successive
-    seeds, from any one on, fall far from each other (the golden-ratio sequence, of low discrepancy).
+    A few random positions leave gaps, in which a policy has seen nothing; who demonstrates spreads them. Those of
+    successive seeds, from any one on, fall far from each other (the golden-ratio sequence, of low discrepancy).
 
     Args:
         seed (`int`):
@@ -59,11 +59,12 @@ def spread(seed: int) -> float:
     return 2 * ((0.5 + seed * GOLDEN_RATIO) % 1) - 1
 
 
-def demonstrate(env: DoorEnv, kind: str, seed: int, num_steps: int) -> Demonstration | None:
+def demonstrate(
+    env: DoorEnv, kind: str, seed: int, num_steps: int, door_offset: float | None = None
+) -> Demonstration | None:
     """Let the expert open a door, and go on holding it open to the last step.
 
-    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`. The
-    door's position is no draw of the environment but [`spread`] over its range.
+    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`.
 
     Args:
         env (`DoorEnv`):
@@ -74,6 +75,8 @@ def demonstrate(env: DoorEnv, kind: str, seed: int, num_steps: int) -> Demonstra
             Seed of the environment and of the expert's timing.
         num_steps (`int`):
             Length of the demonstration.
+        door_offset (`float`, *optional*):
+            Where the door stands, in m; drawn by the environment if it is not given.
 
     Returns:
         `Demonstration | None`: The demonstration, or `None` when the door did not open in time or was out of reach.
@@ -81,7 +84,8 @@ def demonstrate(env: DoorEnv, kind: str, seed: int, num_steps: int) -> Demonstra
     Raises:
         ValueError: If `num_steps` ends before the expert would have tried the door.
     """
-    observation, _ = env.reset(seed=seed, options={"kind": kind, "door_offset": spread(seed) * env.door_offset})
+    options = {"kind": kind} if door_offset is None else {"kind": kind, "door_offset": door_offset}
+    observation, _ = env.reset(seed=seed, options=options)
     expert = DoorExpert(env, directions=(kind,))
     try:
         expert.reset(np.random.default_rng([seed, TIMING_STREAM]))

@@ -26,17 +26,17 @@ LOAD_STEPS = 100
 
 
 def check_kinds(kinds: Sequence[str]) -> None:
-    """Looks whether the flag `--kinds` of a command names kinds of door, each once.
+    """Looks whether names are those of kinds of door, each once.
 
     Args:
         kinds (`Sequence[str]`):
-            Its value.
+            The names.
 
     Raises:
-        ValueError: If it does not; says what is allowed.
+        ValueError: If they are not; says what is allowed.
     """
     if not kinds or sorted(kinds) != sorted(set(kinds) & set(KINDS)):
-        raise ValueError(f"--kinds must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
+        raise ValueError(f"kinds must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from tqdm import tqdm
 
-from env_door.demonstration import Demonstration, demonstrate
+from env_door.demonstration import Demonstration, demonstrate, spread
 from env_door.env import DoorEnv
 from env_door.provenance import Provenance
 from env_door.recording_config import ROBOT_TYPES, RecordConfig
@@ -143,7 +143,9 @@ def _demonstrate_group(
         seed = provenance.next_seed
         group = []
         for kind in kinds:
-            demonstration = demonstrate(env, kind, seed, config.num_steps)
+            # Where each kind has seeds of its own, positions that follow from the seed could tell the kind.
+            door_offset = spread(seed) * config.door_offset if config.matched else None
+            demonstration = demonstrate(env, kind, seed, config.num_steps, door_offset)
             if demonstration is None:
                 break
             group.append(demonstration)

@@ -9,7 +9,7 @@ from huggingface_hub.utils import HFValidationError, validate_repo_id
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from env_door.latch import KINDS
+from env_door.latch import KINDS, check_kinds
 
 ROBOT_TYPES = {"ur5e": "ur5e_robotiq", "panda": "panda"}
 # Options that may change between the runs that make up one dataset.
@@ -49,7 +49,8 @@ class RecordConfig:
         arm (`str`, *optional*, defaults to `"ur5e"`):
             `"ur5e"` or `"panda"`.
         door_offset (`float`, *optional*, defaults to 0.0):
-            Half-width, in metres, of the range over which the lateral shift of the door is spread evenly; 0 to 0.05.
+            Half-width, in metres, of the range of the door's lateral shift, 0 to 0.05: spread evenly over matched
+            demonstrations, drawn for others.
         seed (`int`, *optional*, defaults to 0):
             First seed; the following episodes count up from it.
         matched (`bool`, *optional*, defaults to `True`):
@@ -90,11 +91,7 @@ class RecordConfig:
         _check_repo_id(self.repo_id)
         if self.episodes_per_kind < 1:
             raise ValueError(f"episodes_per_kind must be at least 1, got {self.episodes_per_kind}.")
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
-        if unknown or not self.kinds:
-            raise ValueError(f"kinds must be one or more of {', '.join(KINDS)}, got {self.kinds}.")
-        if len(set(self.kinds)) != len(self.kinds):
-            raise ValueError(f"kinds must not repeat, got {self.kinds}.")
+        check_kinds(self.kinds)
         if self.arm not in ROBOT_TYPES:
             raise ValueError(f"arm must be one of {', '.join(ROBOT_TYPES)}, got {self.arm!r}.")
         if self.seed < 0:

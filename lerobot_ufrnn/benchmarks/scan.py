@@ -218,10 +218,6 @@ def loss(
     return nll.mean(), chosen
 
 
-loss_and_gradients = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames="sizes")
-"""Like `loss`, compiled: `((loss, chosen), gradients)`."""
-
-
 class AdamState(NamedTuple):
     """Parameters with what Adam remembers of each."""
 

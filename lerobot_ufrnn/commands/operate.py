@@ -34,7 +34,7 @@ from env_door.twin.live_door import LiveDoor
 from ..teleoperators import SpaceMouseTwistConfig
 from ..teleoperators.scripted_operator import Event, ToolPath, duration, events_along, write_events
 from .flags import parse_flags
-from .stock import FPS, StockCommand, last_error, late_ticks, record_command
+from .stock import FPS, StockCommand, describe_failure, late_ticks, record_command
 
 LEDGER = Path("meta/door_operation.json")
 """In the data set: kind and seed of each episode."""
@@ -221,7 +221,7 @@ def _operate(
             text, status = command.output(), command.process.returncode
     delays = f"{late_ticks(text)} late ticks, {state['lost_seconds'] - before['lost_seconds']:.1f} s lost by the twin"
     if status != 0:
-        raise AttemptError(f"lerobot-record ended with status {status}: {last_error(text)}")
+        raise AttemptError(f"lerobot-record ended with {describe_failure(status, text)}")
     if not state["is_open"]:
         raise AttemptError(f"the door did not open (opening {state['opening']:.2f} of 1; {delays})")
     if state["attempts"] != [kind]:

@@ -16,7 +16,7 @@ from env_door.twin import TwinProcess
 
 from ..analysis.results import summarize, to_markdown
 from .flags import parse_flags
-from .stock import FPS, StockCommand, last_error, late_ticks, twin_flags
+from .stock import FPS, StockCommand, describe_failure, late_ticks, twin_flags
 
 START_SECONDS = 120.0
 """Longest time for a roll-out to load its policy and connect."""
@@ -125,7 +125,7 @@ def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tup
     """One trial, and what else there is to tell of its roll-out. One that fails on the way is a trial, too.
 
     Raises:
-        RuntimeError: If the roll-out fails; the message has the end of its output.
+        RuntimeError: If it ends before it moves the arm; the message has the end of its output.
     """
     twin.reset(kind, seed)
     with StockCommand(_rollout(config, twin.address)) as rollout:
@@ -136,7 +136,7 @@ def _try(config: RehearseConfig, twin: TwinProcess, kind: str, seed: int) -> tup
     if trial is None:
         raise RuntimeError(f"lerobot-rollout ended with status {status} before it moved the arm:\n{text[-2000:]}")
     told = f"{late_ticks(text)} late ticks"
-    return trial, f"{told}; the roll-out failed: {last_error(text)}" if failed else told
+    return trial, f"{told}; lerobot-rollout ended with {describe_failure(status, text)}" if failed else told
 
 
 def _rollout(config: RehearseConfig, address: str) -> list[str]:

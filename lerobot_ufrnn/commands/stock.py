@@ -91,6 +91,21 @@ def late_ticks(output: str) -> int:
     return output.count("running slower")
 
 
+def describe_failure(status: int | None, output: str) -> str:
+    """How a command failed.
+
+    Args:
+        status (`int | None`):
+            Its exit status.
+        output (`str`):
+            What it printed.
+
+    Returns:
+        `str`: its status, and the error that it ended with or else its last line.
+    """
+    return f"status {status}: {last_error(output) or output.strip().rpartition('\n')[2] or 'it printed nothing'}"
+
+
 def last_error(output: str) -> str:
     """The last thing that a command told its user about its end, without what to do about it.
 

@@ -13,7 +13,8 @@ from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from env_door.demonstration import demonstrate
+from env_door import recording
+from env_door.demonstration import demonstrate, spread
 from env_door.env import DoorEnv
 from env_door.recording import record
 from env_door.recording_config import FrameEncoderConfig, RecordConfig
@@ -176,3 +177,17 @@ def test_panda_has_its_own_joints(tmp_path):
     assert dataset.features["action"]["names"] == dataset.features["observation.state"]["names"] == names
     assert dataset.meta.robot_type == "panda"
     assert dataset[149]["action"].shape == (8,)
+
+
+@pytest.mark.parametrize("matched", [True, False])
+def test_matched_demonstrations_spread_the_door_and_others_draw_it(tmp_path, monkeypatch, matched):
+    asked = []
+
+    def fail(env, kind, seed, num_steps, door_offset):
+        asked.append((seed, door_offset))
+
+    monkeypatch.setattr(recording, "demonstrate", fail)
+    config = RecordConfig("me/door", root=tmp_path / "data", door_offset=0.02, matched=matched)
+    with pytest.raises(RuntimeError, match="failed at 20 seeds"):
+        record(config)
+    assert asked == [(seed, 0.02 * spread(seed) if matched else None) for seed in range(20)]

@@ -46,8 +46,9 @@ def test_the_scan_computes_what_the_reference_computes(problem):
     )
     expected = torch_loss(model, *episodes, torch.Generator().manual_seed(3))
     expected.backward()
+    loss_and_gradients = scan.jax.jit(scan.jax.value_and_grad(scan.loss, has_aux=True), static_argnames="sizes")
     with scan.jax.enable_x64(True):
-        (value, chosen), gradients = scan.loss_and_gradients(
+        (value, chosen), gradients = loss_and_gradients(
             {name: weight.detach().numpy() for name, weight in model.network.named_parameters()},
             *(values.transpose(0, 1).numpy() for values in episodes),
             noise.numpy(),

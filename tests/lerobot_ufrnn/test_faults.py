@@ -17,7 +17,7 @@ from lerobot_ufrnn.analysis.fault_table import Outcome, Sample, moves_again, sta
 from lerobot_ufrnn.commands import faults, main
 from lerobot_ufrnn.commands.injection import FAULTS
 from lerobot_ufrnn.commands.recorded import readable_episodes
-from lerobot_ufrnn.commands.stock import StockCommand, last_error
+from lerobot_ufrnn.commands.stock import StockCommand, describe_failure, last_error
 from lerobot_ufrnn.robots.ur5e_robotiq.orderly_end import OrderlyEnd
 
 # ── Speeds ────────────────────────────────────────────────────────────
@@ -296,6 +296,12 @@ INFO 2025-01-01 errors.py:12 Exiting
     assert last_error("INFO no Error in here\n") == ""
     ending = "WARNING 2025-01-01 orderly_end.py:12 Ending, as asked for by SIGHUP: what is open is closed first.\n"
     assert last_error(ending + "INFO 2025-01-01 Exiting\n") == "Ending, as asked for by SIGHUP"
+
+
+def test_a_failure_is_told_even_without_an_error():
+    assert describe_failure(1, "INFO connected\nValueError: no arm\nINFO bye\n") == "status 1: ValueError: no arm"
+    assert describe_failure(2, "usage\nrecord: error: unknown\n") == "status 2: record: error: unknown"
+    assert describe_failure(-9, "") == "status -9: it printed nothing"
 
 
 def test_a_command_that_ends_without_saying_so_is_told(monkeypatch):

@@ -105,7 +105,7 @@ def test_a_roll_out_that_fails_on_the_way_is_a_trial_and_its_error_is_told(tmp_p
     config = RehearseConfig("checkpoint", tmp_path / "trials.jsonl", duration=3000.0)
     trial, told = rehearse._try(config, Script(state(1.0), state(4.0)), "pull", 7)
     assert (trial.success, trial.steps) == (False, 30)
-    assert told == "1 late ticks; the roll-out failed: RuntimeError: The arm was stopped"
+    assert told == "1 late ticks; lerobot-rollout ended with status 1: RuntimeError: The arm was stopped"
 
 
 def test_the_roll_out_is_the_stock_command_without_a_return_to_the_first_pose(tmp_path):
@@ -119,7 +119,7 @@ def test_the_roll_out_is_the_stock_command_without_a_return_to_the_first_pose(tm
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
-        ("--kinds=[up]", "--kinds must be one or more of"),
+        ("--kinds=[up]", "kinds must be one or more of"),
         ("--kinds=[push,push]", "each once"),
         ("--trials_per_kind=0", "at least 1"),
         ("--duration=0", "--duration must be above 0"),

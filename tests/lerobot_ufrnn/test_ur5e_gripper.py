@@ -104,7 +104,7 @@ def test_an_active_gripper_is_not_moved_by_connecting(fake, connected):
 
 def test_a_gripper_that_is_not_active_is_activated_first(fake, connected):
     server = fake(status=0)
-    connected(server)
+    connected(server, gripper_force=0.2)
     assert server.commands.index("SET ACT 1 GTO 1") < server.commands.index("SET GTO 1 SPE 255 FOR 51")
 
 
