@@ -1,11 +1,12 @@
 """A command of LeRobot that runs beside ours, against the robot's digital twin."""
 
+import contextlib
 import re
 import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from env_door.twin import ports
@@ -31,7 +32,8 @@ def twin_flags(address: str) -> list[str]:
     Returns:
         `list[str]`: `--robot.*` flags.
     """
-    camera = f"{{type: zmq, server_address: {address}, port: {ports.CAMERA}, camera_name: front"
+    # LeRobot waits 2 s for the thread that reads the camera; one that waits longer for a picture can block the end.
+    camera = f"{{type: zmq, server_address: {address}, port: {ports.CAMERA}, camera_name: front, timeout_ms: 1000"
     return [
         "--robot.type=ur5e_robotiq",
         "--robot.id=twin",
@@ -106,6 +108,22 @@ def describe_failure(status: int | None, output: str) -> str:
     return f"status {status}: {last_error(output) or output.strip().rpartition('\n')[2] or 'it printed nothing'}"
 
 
+@contextlib.contextmanager
+def _heeded(*signals: signal.Signals) -> Iterator[None]:
+    """Lets programs that are started here heed signals that they would inherit as ignored.
+
+    A background job of a shell script ignores SIGINT, and one under `nohup` SIGHUP.
+    """
+    ignored = [number for number in signals if signal.getsignal(number) is signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        for number in ignored:
+            signal.signal(number, signal.SIG_IGN)
+
+
 def last_error(output: str) -> str:
     """The last thing that a command told its user about its end, without what to do about it.
 
@@ -135,13 +153,14 @@ class StockCommand:
 
     def __enter__(self) -> "StockCommand":
         self._output = tempfile.TemporaryFile()
-        self.process = subprocess.Popen(
-            with_this_python(self._command),
-            stdin=subprocess.DEVNULL,
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,  # Ctrl-C reaches our process alone, which then ends it in order
-        )
+        with _heeded(signal.SIGINT, signal.SIGHUP):
+            self.process = subprocess.Popen(
+                with_this_python(self._command),
+                stdin=subprocess.DEVNULL,
+                stdout=self._output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C reaches our process alone, which then ends it in order
+            )
         return self
 
     def __exit__(self, *exc_info: object) -> None:

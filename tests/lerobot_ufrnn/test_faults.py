@@ -312,6 +312,20 @@ def test_a_command_that_ends_without_saying_so_is_told(monkeypatch):
             command.wait_for("moving", 30.0)
 
 
+def test_a_command_heeds_an_interrupt_even_if_a_background_job_started_it(monkeypatch):
+    monkeypatch.setattr("lerobot_ufrnn.commands.stock.with_this_python", lambda command: command)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with StockCommand([sys.executable, "-c", "import time; print('here', flush=True); time.sleep(60)"]) as command:
+            command.wait_for("here", 30.0)
+            command.stop()
+            assert command.process.returncode == -signal.SIGINT
+            assert "KeyboardInterrupt" in command.output()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_a_command_that_takes_too_long_is_told(monkeypatch):
     monkeypatch.setattr("lerobot_ufrnn.commands.stock.with_this_python", lambda command: command)
     with (
