@@ -25,18 +25,20 @@ LOAD_STEPS = 100
 """Physics steps (of 2 ms) for which a load must last: a robot that trembles tries nothing, one that pushes does."""
 
 
-def check_kinds(kinds: Sequence[str]) -> None:
+def check_kinds(kinds: Sequence[str], option: str) -> None:
     """Looks whether names are those of kinds of door, each once.
 
     Args:
         kinds (`Sequence[str]`):
             The names.
+        option (`str`):
+            What the user set them with, for the message.
 
     Raises:
         ValueError: If they are not; says what is allowed.
     """
     if not kinds or sorted(kinds) != sorted(set(kinds) & set(KINDS)):
-        raise ValueError(f"kinds must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
+        raise ValueError(f"{option} must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
 
 
 @dataclass(frozen=True)

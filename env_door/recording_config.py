@@ -91,7 +91,7 @@ class RecordConfig:
         _check_repo_id(self.repo_id)
         if self.episodes_per_kind < 1:
             raise ValueError(f"episodes_per_kind must be at least 1, got {self.episodes_per_kind}.")
-        check_kinds(self.kinds)
+        check_kinds(self.kinds, "kinds")
         if self.arm not in ROBOT_TYPES:
             raise ValueError(f"arm must be one of {', '.join(ROBOT_TYPES)}, got {self.arm!r}.")
         if self.seed < 0:

@@ -142,7 +142,9 @@ def _draw_model(panel: Axes, model: HiddenPaths) -> None:
     if model.success:
         panel.plot(*model.trial[-1], marker="*", markersize=13, markerfacecolor="white", markeredgecolor="black")
     result = f"opened at step {len(model.trial) - 1}" if model.success else "not opened"
-    first_try = "first try {1} at step {0}".format(*model.attempts[0]) if model.attempts else "no try"
+    first_try = "no try"
+    if model.attempts:
+        first_try = f"first try {model.attempts[0].direction} at step {model.attempts[0].step}"
     panel.set_title(f"{model.label}\n{model.door_kind} door: {first_try},\n{result}", fontsize=9)
     first, second = model.shares
     panel.set(xlabel=f"PC 1 ({first:.0%})", ylabel=f"PC 2 ({second:.0%})")

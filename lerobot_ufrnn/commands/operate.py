@@ -85,7 +85,7 @@ class OperateConfig:
             raise ValueError(f"--repo_id must read {{hf_username}}/{{dataset_name}}, got {self.repo_id!r}.")
         if self.repo_id.split("/")[1].startswith("eval_"):
             raise ValueError(f"--repo_id: LeRobot keeps names with 'eval_' for evaluations, got {self.repo_id!r}.")
-        check_kinds(self.kinds)
+        check_kinds(self.kinds, "--kinds")
         for name, least in (("episodes_per_kind", 1), ("seed", 0), ("attempts", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} must be at least {least}, got {getattr(self, name)}.")

@@ -60,7 +60,7 @@ class RehearseConfig:
     hold_seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        check_kinds(self.kinds)
+        check_kinds(self.kinds, "--kinds")
         if self.trials_per_kind < 1 or self.seed < 0:
             raise ValueError("--trials_per_kind must be at least 1 and --seed at least 0.")
         if not 0 < self.duration <= 3600:

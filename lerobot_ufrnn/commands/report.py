@@ -68,7 +68,7 @@ class ReportConfig:
     num_steps: int = 300
 
     def __post_init__(self) -> None:
-        check_kinds(self.kinds)
+        check_kinds(self.kinds, "--kinds")
         for name in ("trials_per_kind", "num_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}.")

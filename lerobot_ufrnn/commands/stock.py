@@ -93,6 +93,22 @@ def late_ticks(output: str) -> int:
     return output.count("running slower")
 
 
+def last_error(output: str) -> str:
+    """The last thing that a command told its user about its end, without what to do about it.
+
+    Args:
+        output (`str`):
+            What the command printed.
+
+    Returns:
+        `str`: an error with its name, or what asked the command to end; empty if there is neither.
+    """
+    errors = re.findall(
+        r"^(?:\w+\.)*(\w+(?:Error|Exception|Interrupt)\b.*)|(Ending, as asked for by \w+)", output, re.M
+    )
+    return "".join(errors[-1]).split(". To go on:")[0].strip() if errors else ""
+
+
 def describe_failure(status: int | None, output: str) -> str:
     """How a command failed.
 
@@ -122,22 +138,6 @@ def _heeded(*signals: signal.Signals) -> Iterator[None]:
     finally:
         for number in ignored:
             signal.signal(number, signal.SIG_IGN)
-
-
-def last_error(output: str) -> str:
-    """The last thing that a command told its user about its end, without what to do about it.
-
-    Args:
-        output (`str`):
-            What the command printed.
-
-    Returns:
-        `str`: an error with its name, or what asked the command to end; empty if there is neither.
-    """
-    errors = re.findall(
-        r"^(?:\w+\.)*(\w+(?:Error|Exception|Interrupt)\b.*)|(Ending, as asked for by \w+)", output, re.M
-    )
-    return "".join(errors[-1]).split(". To go on:")[0].strip() if errors else ""
 
 
 class StockCommand:

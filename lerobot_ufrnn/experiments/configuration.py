@@ -113,7 +113,7 @@ class ProtocolConfig:
         ):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} must be at least {least}, got {getattr(self, name)}.")
-        check_kinds(self.kinds)
+        check_kinds(self.kinds, "--kinds")
         if bool(self.variant) != bool(self.policy_flags) or not set(self.variant) <= NAME_CHARACTERS:
             raise ValueError(
                 "--variant must name --policy_flags in letters, digits, '_' and '-', and neither goes without the "

@@ -359,7 +359,7 @@ def test_the_command_is_the_stock_one_with_the_encoder_of_the_simulation(stage, 
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
-        ("--kinds=[up]", "kinds must be one or more of"),
+        ("--kinds=[up]", "--kinds must be one or more of"),
         ("--kinds=[push,push]", "each once"),
         ("--episodes_per_kind=0", "--episodes_per_kind must be at least 1, got 0"),
         ("--seed=-1", "--seed must be at least 0"),

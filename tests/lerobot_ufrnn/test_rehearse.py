@@ -119,7 +119,7 @@ def test_the_roll_out_is_the_stock_command_without_a_return_to_the_first_pose(tm
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
-        ("--kinds=[up]", "kinds must be one or more of"),
+        ("--kinds=[up]", "--kinds must be one or more of"),
         ("--kinds=[push,push]", "each once"),
         ("--trials_per_kind=0", "at least 1"),
         ("--duration=0", "--duration must be above 0"),

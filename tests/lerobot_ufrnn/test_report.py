@@ -255,7 +255,7 @@ def test_a_broken_file_ends_with_a_message_and_leaves_the_last_page(results, nam
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
-        ("--kinds=[push,lift]", "kinds must be one or more of"),
+        ("--kinds=[push,lift]", "--kinds must be one or more of"),
         ("--trials_per_kind=0", "--trials_per_kind must be at least 1"),
         ("--dataset_dir=/nowhere", "there is no folder '/nowhere'"),
         ("--policy_path=/nowhere", "/nowhere"),
