@@ -70,6 +70,24 @@ def drifting_noise(like: Tensor, std: float, correlation: float, generator: Gene
     return torch.stack(steps, dim=1)
 
 
+def hold_end(values: Tensor, num_steps: int) -> Tensor:
+    """Goes on with an episode's last moment for some steps.
+
+    Recordings often stop as soon as the task is done, while the arm still moves. A network that has never seen what
+    comes after slows down on its way there; one that has learned to stay where a demonstration ended is led to it.
+
+    Args:
+        values (`Tensor`):
+            What was recorded, (L, D).
+        num_steps (`int`):
+            How many steps to add.
+
+    Returns:
+        `Tensor`: (L + num_steps, D).
+    """
+    return torch.cat((values, values[-1:].expand(num_steps, -1)))
+
+
 def stall_indices(
     length: int, probability: float, max_steps: int, max_length: int, generator: Generator | None = None
 ) -> Tensor:

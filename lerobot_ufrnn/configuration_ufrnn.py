@@ -76,6 +76,8 @@ class UFRNNConfig(PreTrainedConfig):
             Imagined steps that are carried out, at the arm's pace, before it listens to its senses again.
         recall_memory (`float`, *optional*, defaults to `200.0`):
             Steps in which the memory of a failed try fades to 1/e; 0 forgets at once.
+        recall_at_rest (`bool`, *optional*, defaults to `True`):
+            Whether it also goes back when the arm has come to rest where no demonstration ended (see `rest.py`).
 
         joint_hidden_dim (`int`, *optional*, defaults to `50`):
             Hidden size of `LSTM_joint`.
@@ -124,6 +126,9 @@ class UFRNNConfig(PreTrainedConfig):
         input_noise_correlation (`float`, *optional*, defaults to `0.95`):
             Correlation of that noise from step to step. Noise that drifts teaches the network to lead back to the
             demonstrated way from beside it, so that what it imagines in closed loop stays true.
+        hold_end_steps (`int`, *optional*, defaults to `0`):
+            Steps for which training holds the last moment of a demonstration on. For recordings that stop while the arm
+            still moves, 20 make it come to rest where they ended, instead of before.
         stall_probability (`float`, *optional*, defaults to `0.0`):
             Probability per step that the observation stalls and its target waits (training only). Stalls tie progress
             to what is seen; they also make episodes longer and learning slower.
@@ -161,6 +166,7 @@ class UFRNNConfig(PreTrainedConfig):
     recall_horizon: int = 60
     recall_commitment: int = 24
     recall_memory: float = 200.0
+    recall_at_rest: bool = True
 
     joint_hidden_dim: int = 50
     image_hidden_dim: int = 50
@@ -184,6 +190,7 @@ class UFRNNConfig(PreTrainedConfig):
     kernel: str = "auto"
     input_noise: float = 0.05
     input_noise_correlation: float = 0.95
+    hold_end_steps: int = 0
     stall_probability: float = 0.0
     stall_steps: int = 12
     stall_stretch: float = 1.3
@@ -211,7 +218,7 @@ class UFRNNConfig(PreTrainedConfig):
             *("conv_first_stride", "recall_samples", "recall_horizon"),
         ):
             self._require(name, getattr(self, name) >= 1, "at least 1")
-        for name in ("image_shift", "drop_n_last_frames", "recall_commitment"):
+        for name in ("image_shift", "drop_n_last_frames", "recall_commitment", "hold_end_steps"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         for name in ("image_jitter", "image_noise", "input_noise", "input_noise_correlation"):
             self._require(name, 0 <= getattr(self, name) < 1, "from 0 to below 1")

@@ -9,7 +9,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 from torch import Generator, Tensor, nn
 
-from .augmentation import augment_images, drifting_noise, stall_indices
+from .augmentation import augment_images, drifting_noise, hold_end, stall_indices
 from .checkpoint import find_weights, read_weights
 from .configuration_ufrnn import UFRNNConfig
 from .episodes import Episode, EpisodeStore
@@ -17,6 +17,7 @@ from .foresight import Foresight, ForesightTrace, NoiseSchedule
 from .networks import SHLSTM, ImageEncoder, Prediction, RangeScaler, gaussian_nll
 from .recall import Recall
 from .recurrent import UFRNN, Memory
+from .rest import RestDetector
 
 logger = logging.getLogger(__name__)
 
@@ -99,6 +100,7 @@ class UFRNNPolicy(PreTrainedPolicy):
                 config.keep_unperturbed,
             ),
         )
+        self.rest = RestDetector(joint_dim)
         self.recall: Recall | None = None
         if config.recall:
             self.recall = Recall(
@@ -109,6 +111,7 @@ class UFRNNPolicy(PreTrainedPolicy):
                 config.recall_horizon,
                 config.recall_commitment,
                 config.recall_memory,
+                self.rest if config.recall_at_rest else None,
             )
         # Training noise is a function of this seed and the update, so that a resumed run goes on exactly as if whole.
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
@@ -116,6 +119,7 @@ class UFRNNPolicy(PreTrainedPolicy):
         if dataset_stats is not None:
             self._fit_joint_scaler(dataset_stats)
         self.episodes: EpisodeStore | None = None
+        self._observed: set[int] = set()  # episodes whose ends are remembered
         if dataset_meta is not None:
             self.episodes = EpisodeStore(dataset_meta, config.cameras, self.image_encoder)
             config.drop_n_last_frames = _frames_to_drop(self.episodes.lengths)
@@ -234,11 +238,19 @@ class UFRNNPolicy(PreTrainedPolicy):
             self._load_autoencoder(self.config.autoencoder_path)
         if not self.trains_autoencoder:
             self.episodes.encode()
-        episodes = [self.episodes[index] for index in batch["episode_index"].flatten().tolist()]
+        indices = batch["episode_index"].flatten().tolist()
+        episodes = [self.episodes[index] for index in indices]
+        if self.training:
+            self._observe_rests(dict(zip(indices, episodes, strict=True)))
         generator = torch.Generator(self.updates.device).manual_seed(int(self.noise_seed) + int(self.updates))
         if self.trains_autoencoder:
             return self._autoencoder_loss(episodes, generator)
         return self._recurrent_loss(episodes, generator)
+
+    def _observe_rests(self, episodes: dict[int, Episode]) -> None:
+        for index in episodes.keys() - self._observed:
+            self.rest.observe(self.joint_scaler.scale(episodes[index].states.to(self.updates.device)))
+            self._observed.add(index)
 
     def update(self) -> None:
         """Counts an update; `lerobot-train` calls it after each optimiser step. Closes the autoencoder's phase."""
@@ -322,12 +334,17 @@ class UFRNNPolicy(PreTrainedPolicy):
         return inputs, targets, commands, torch.arange(inputs.shape[1], device=inputs.device) < lengths[:, None]
 
     def _sequence(self, episode: Episode) -> tuple[Tensor, Tensor, Tensor]:
-        """Inputs and what they lead to (L - 1, D), and the commands in between (L - 1, D_j), all scaled."""
+        """Inputs and what they lead to (L - 1, D), and the commands in between (L - 1, D_j), all scaled.
+
+        In training L counts the steps for which the last moment is held on.
+        """
         device = self.updates.device
         states = self.joint_scaler.scale(episode.states.to(device))
-        features = self.image_encoder.scaler.scale(episode.features)
-        sensed = torch.cat((states, features), -1)
-        return sensed[:-1], sensed[1:], self.joint_scaler.scale(episode.actions.to(device))[:-1]
+        actions = self.joint_scaler.scale(episode.actions.to(device))
+        sensed = torch.cat((states, self.image_encoder.scaler.scale(episode.features)), -1)
+        if self.training:
+            sensed, actions = (hold_end(values, self.config.hold_end_steps) for values in (sensed, actions))
+        return sensed[:-1], sensed[1:], actions[:-1]
 
     def _fit_joint_scaler(self, stats: dict[str, dict[str, Tensor]]) -> None:
         """One range for measured and commanded joints: a command fed back must mean what a measurement means."""

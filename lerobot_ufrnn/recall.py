@@ -7,7 +7,8 @@ standard deviation. Recall, our addition to the paper, acts on it, at run time o
 
 1. **Surprised?** The squared prediction error of the joints in units of the predicted variance, one on average while
    all goes as foreseen, is smoothed over a few steps and compared with a threshold. It counts only while the arm does
-   not make the foreseen movement: one that lags under a load is not wrong.
+   not make the foreseen movement: one that lags under a load is not wrong. A rest where no demonstration ended counts
+   as a surprise, too, even if it was foreseen (`rest.py`).
 2. **Go back.** The arm returns to its pose of the last moment before the surprise. What it was doing is refuted.
 3. **Imagine.** Copies of that moment imagine to sense something other than expected, by as much as the network was
    uncertain of it, and play their futures to a long horizon, in closed loop (`alternatives.py`).
@@ -28,6 +29,7 @@ from .attempt import Attempt, Outcome, progress
 from .foresight import Foresight, ForesightTrace
 from .networks import HiddenState, Prediction
 from .recurrent import UFRNN, Memory
+from .rest import REST_STEPS, RestDetector
 
 SMOOTHING = 0.5
 """Weight of the past in the running surprise."""
@@ -92,7 +94,8 @@ class _Moment:
 class _Episode:
     """What one episode of the batch remembers."""
 
-    trail: deque[_Moment]
+    trail: deque[_Moment] = field(default_factory=lambda: deque(maxlen=LONGEST_TRAIL))
+    poses: deque[Tensor] = field(default_factory=lambda: deque(maxlen=REST_STEPS + 1))  # joints outside of attempts
     step: int = -1
     surprise: float = 0.0
     anchor: _Moment | None = None  # the last one before the surprise
@@ -123,6 +126,8 @@ class Recall:
             Imagined steps that are carried out.
         memory (`float`):
             Steps in which the memory of a failed try fades to 1/e; 0 forgets at once.
+        rest (`RestDetector`, *optional*):
+            Tells a rest that is none of a demonstration's end; without it only surprise makes an episode go back.
     """
 
     def __init__(
@@ -134,6 +139,7 @@ class Recall:
         horizon: int,
         commitment: int,
         memory: float,
+        rest: RestDetector | None = None,
     ):
         self.exploration = model.foresight.exploration
         self.model = type(model)(model.network, Foresight("none", model.foresight.schedule, num_samples=1, horizon=1))
@@ -143,6 +149,7 @@ class Recall:
         self.horizon = horizon
         self.commitment = commitment
         self.memory = memory
+        self.rest = rest
         self.keep_futures = False
         self.reset()
 
@@ -175,7 +182,7 @@ class Recall:
         """
         joints = inputs[:, : self.model.network.joint_dim]
         if self._joints is None:
-            self._episodes = [_Episode(deque(maxlen=LONGEST_TRAIL)) for _ in range(len(inputs))]
+            self._episodes = [_Episode() for _ in range(len(inputs))]
             self._joints = joints
         surprises = surprise(joints, memory.prediction)
         moves = progress(self._joints, joints, memory.prediction.mean[:, : joints.shape[-1]]) >= STALLED
@@ -210,7 +217,8 @@ class Recall:
             episode.surprise *= SMOOTHING
             if not moves:
                 episode.surprise += (1 - SMOOTHING) * surprise_now
-            if episode.surprise > self.threshold and episode.trail:
+            episode.poses.append(joints)
+            if (episode.surprise > self.threshold or self._rests(episode)) and episode.trail:
                 self._remember(episode, state)
                 return self._go_back(episode, generator)
             episode.trail.append(_Moment(episode.step, state, episode.surprise))
@@ -228,6 +236,11 @@ class Recall:
                 return self._go_back(episode, generator)
         episode.attempt = None
         return None
+
+    def _rests(self, episode: _Episode) -> bool:
+        if self.rest is None or len(episode.poses) <= REST_STEPS:
+            return False
+        return self.rest.detects(torch.stack(tuple(episode.poses)))
 
     def _remember(self, episode: _Episode, state: HiddenState) -> None:
         """Takes what was being done as refuted, and the last calm moment as the one to go on from."""
@@ -259,6 +272,7 @@ class Recall:
         begin = slice(self.commitment + 1), chosen
         episode.attempt = Attempt(found.states.at(begin), found.joints[begin], found.ends[chosen])
         episode.surprise = 0.0
+        episode.poses.clear()
         kept = Prediction(*(values[1:] for values in found.predictions)) if self.keep_futures else None
         episode.events.append(RecallEvent(episode.step, episode.step - anchor.step, refuted, chosen, kept))
         return anchor.state
