@@ -119,7 +119,7 @@ class UFRNNPolicy(PreTrainedPolicy):
         if dataset_stats is not None:
             self._fit_joint_scaler(dataset_stats)
         self.episodes: EpisodeStore | None = None
-        self._observed: set[int] = set()  # episodes whose ends are remembered
+        self._observed: set[int] = set()  # episodes that `rest` has learned from
         if dataset_meta is not None:
             self.episodes = EpisodeStore(dataset_meta, config.cameras, self.image_encoder)
             config.drop_n_last_frames = _frames_to_drop(self.episodes.lengths)
@@ -241,15 +241,16 @@ class UFRNNPolicy(PreTrainedPolicy):
         indices = batch["episode_index"].flatten().tolist()
         episodes = [self.episodes[index] for index in indices]
         if self.training:
-            self._observe_rests(dict(zip(indices, episodes, strict=True)))
+            for index, episode in zip(indices, episodes, strict=True):
+                self._observe_rest(index, episode)
         generator = torch.Generator(self.updates.device).manual_seed(int(self.noise_seed) + int(self.updates))
         if self.trains_autoencoder:
             return self._autoencoder_loss(episodes, generator)
         return self._recurrent_loss(episodes, generator)
 
-    def _observe_rests(self, episodes: dict[int, Episode]) -> None:
-        for index in episodes.keys() - self._observed:
-            self.rest.observe(self.joint_scaler.scale(episodes[index].states.to(self.updates.device)))
+    def _observe_rest(self, index: int, episode: Episode) -> None:
+        if index not in self._observed:
+            self.rest.observe(self.joint_scaler.scale(episode.states.to(self.updates.device)))
             self._observed.add(index)
 
     def update(self) -> None:

@@ -3,7 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_ufrnn.augmentation import augment_images, drifting_noise, stall_indices
+from lerobot_ufrnn.augmentation import augment_images, drifting_noise, hold_end, stall_indices
 
 
 def test_a_shift_moves_the_image_and_repeats_its_border():
@@ -67,3 +67,9 @@ def test_stalls_come_as_often_and_last_as_long_as_asked():
 
 def test_no_stalls_leave_the_episode_alone():
     assert stall_indices(9, 0.0, 4, 100).tolist() == list(range(9))
+
+
+def test_a_held_end_is_the_last_moment_over_and_over():
+    values = torch.arange(6.0).reshape(3, 2)
+    assert hold_end(values, 2).tolist() == [[0, 1], [2, 3], [4, 5], [4, 5], [4, 5]]
+    assert hold_end(values, 0).tolist() == values.tolist()

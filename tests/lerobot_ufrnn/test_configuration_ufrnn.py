@@ -66,6 +66,7 @@ def test_a_saved_configuration_loads_equal(tmp_path):
         ("surprise_threshold", 1.0, "above 1"),
         ("surprise_threshold", float("inf"), "above 1"),
         ("recall_commitment", -1, "at least 0"),
+        ("hold_end_steps", -1, "at least 0"),
         ("recall_commitment", 61, "at most"),
         ("recall_memory", -1.0, "at least 0"),
         ("recall_memory", float("nan"), "at least 0"),

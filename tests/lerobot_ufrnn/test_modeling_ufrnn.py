@@ -9,6 +9,7 @@ from oracle import Oracle
 from small import batch_of, make_dataset, observation, small_config, train
 
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
+from lerobot_ufrnn.rest import REST_STEPS
 
 
 def make_trained(dataset, **overrides) -> UFRNNPolicy:
@@ -266,6 +267,50 @@ def test_targets_are_the_next_sensor_values(dataset):
     torch.testing.assert_close(policy.joint_scaler.unscale(inputs[:, :3]), episode.states[:-1])
     torch.testing.assert_close(policy.joint_scaler.unscale(targets[:, :3]), episode.states[1:])
     torch.testing.assert_close(policy.joint_scaler.unscale(commands), episode.actions[:-1])
+
+
+def test_training_holds_the_last_moment_on(dataset):
+    policy = make_policy(small_config(hold_end_steps=3), ds_meta=dataset.meta)
+    train(policy, [batch_of(0, 1, 2)] * 3)
+    episode = policy.episodes[1]
+    longer = policy.train()._sequence(episode)
+    for recorded, held in zip(policy.eval()._sequence(episode), longer, strict=True):
+        assert len(held) == len(recorded) + 3
+        assert torch.equal(held[: len(recorded)], recorded)
+    inputs, targets, commands = (values[-3:] for values in longer)
+    last = torch.cat(
+        (policy.joint_scaler.scale(episode.states[-1]), policy.image_encoder.scaler.scale(episode.features[-1]))
+    )
+    assert torch.equal(inputs, last.expand(3, -1))
+    assert torch.equal(targets, last.expand(3, -1))
+    assert torch.equal(commands, policy.joint_scaler.scale(episode.actions[-1]).expand(3, -1))
+
+
+def test_training_remembers_where_each_demonstration_ended_and_a_checkpoint_keeps_it(dataset, tmp_path):
+    policy = make_policy(small_config(), ds_meta=dataset.meta)
+    policy.eval().forward(batch_of(0))
+    assert not policy.rest.endings.any()  # only training learns
+    train(policy, [batch_of(0, 1), batch_of(1, 2)])
+    ends = torch.stack([policy.episodes[index].states[-1] for index in range(3)])
+    expected = {tuple(row) for row in policy.joint_scaler.scale(ends).tolist()}
+    policy.save_pretrained(tmp_path)
+    for remembered in (policy, type(policy).from_pretrained(tmp_path)):
+        assert {tuple(row) for row in remembered.rest.endings.tolist()} == expected
+
+
+@pytest.mark.parametrize("at_rest", [True, False])
+def test_a_policy_goes_back_from_a_rest_unless_told_not_to(dataset, at_rest):
+    policy = make_policy(small_config(recall_at_rest=at_rest, surprise_threshold=1e9), ds_meta=dataset.meta)
+    train(policy, [batch_of(0, 1, 2)] * 3)
+    line = torch.linspace(0, 5, 100).unsqueeze(1).expand(-1, 3)
+    policy.rest.observe(line)  # it went far, and its end is far from all that follows
+    policy.rest.least_movement.copy_(torch.tensor(1.0))
+    policy.rest.endings.copy_(line[-1:])
+    policy.eval().reset()
+    still = observation(2)
+    for _ in range(REST_STEPS + 1):
+        policy.select_action(still)
+    assert [len(events) for events in policy.recall.events] == [int(at_rest)] * 2
 
 
 def test_commands_that_lead_nowhere_near_are_learned_all_the_same(tmp_path):

@@ -17,6 +17,7 @@ from lerobot_ufrnn.kernels.unroll import FastUFRNN
 from lerobot_ufrnn.networks import HiddenState, Prediction
 from lerobot_ufrnn.recall import LONGEST_RETURN, LONGEST_TRAIL, STALLED, Recall, surprise
 from lerobot_ufrnn.recurrent import UFRNN, Memory
+from lerobot_ufrnn.rest import REST_STEPS
 
 # With a surprise of 6 at each step, the running surprise is 3, which is above half the threshold, and then 4.5.
 THRESHOLD, CONTRADICTION, STEPS_TO_FIRE = 4.0, 6.0, 2
@@ -222,6 +223,51 @@ def test_it_does_not_go_back_before_there_is_anywhere_to_go():
     assert not world.events
     world.step(2 * THRESHOLD + 0.01, exact=False)
     assert [(event.step, event.steps_back) for event in world.events] == [(1, 1)]
+
+
+class StandsStill:
+    """Calls it a rest if no joint has moved at all."""
+
+    def detects(self, joints):
+        assert joints.shape == (REST_STEPS + 1, JOINTS)
+        return bool((joints == joints[0]).all())
+
+
+def resting_world(**overrides) -> World:
+    """Nothing surprises, but the arm stands still after `CALM_STEPS` until recall goes back."""
+    world = World(make_recall(threshold=float("inf"), rest=StandsStill(), **overrides), torch.Generator())
+    world.steps(CALM_STEPS)
+    for _ in range(REST_STEPS):
+        assert not world.events
+        world.stand()
+    return world
+
+
+@pytest.mark.parametrize("kernel", [UFRNN, FastUFRNN])
+def test_it_goes_back_by_a_step_from_a_rest_although_nothing_surprises(kernel):
+    world = resting_world(kernel=kernel)
+    last = CALM_STEPS + REST_STEPS - 1
+    assert [(event.step, event.steps_back) for event in world.events] == [(last, 1)]
+    assert is_equal(world.now.state, world.memories[last - 1].state)
+
+
+def test_a_rest_begins_anew_when_a_future_has_been_carried_out():
+    world = resting_world()
+    world.finish()
+    world.step()  # from now on it listens again
+    for _ in range(REST_STEPS + 1):
+        assert len(world.events) == 1
+        world.stand()
+    assert len(world.events) == 2
+
+
+def test_without_a_detector_or_while_it_moves_there_is_no_rest():
+    for rest in (None, StandsStill()):
+        world = World(make_recall(threshold=float("inf"), rest=rest))
+        world.steps(CALM_STEPS)
+        for _ in range(3 * REST_STEPS):
+            world.step() if rest else world.stand()
+        assert not world.events
 
 
 # ── Going back ────────────────────────────────────────────────────────
