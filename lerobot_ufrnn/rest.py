@@ -1,16 +1,18 @@
 """Rest: has the arm come to a standstill where no demonstration ended?
 
 Where demonstrations part, a network that has learned both ways can be led to the mean of them. If they are opposites,
-that is no movement at all, and it is foreseen: nothing surprises. But demonstrations rest at their ends only.
+that is no movement at all, and it is foreseen: nothing surprises. But demonstrations rest at their ends only; where
+one paused on its way for as long, a rest tells nothing, and none is detected.
 """
 
 import torch
 from torch import Tensor, nn
 
-from .attempt import LEAST_PROGRESS
-
 REST_STEPS = 20
 """Steps of standstill that are a rest."""
+
+STANDSTILL = 0.15
+"""Share of the least that demonstrations moved in as many steps below which an arm stands still."""
 
 MOST_ENDINGS = 64
 """Remembered ends of demonstrations; of more, those that differ most."""
@@ -69,7 +71,7 @@ class RestDetector(nn.Module):
         Returns:
             `bool`: whether it moved far less than any demonstration did in as many steps, and is at no ending.
         """
-        if not bool(_movement(joints) < LEAST_PROGRESS * self.least_movement):
+        if not bool(_movement(joints) < STANDSTILL * self.least_movement):
             return False
         return bool((self.endings - joints[-1]).norm(dim=-1).min() > AT_AN_ENDING * self.extent)
 

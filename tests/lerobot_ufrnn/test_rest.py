@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from lerobot_ufrnn.attempt import LEAST_PROGRESS
-from lerobot_ufrnn.rest import AT_AN_ENDING, MOST_ENDINGS, REST_STEPS, RestDetector
+from lerobot_ufrnn.rest import AT_AN_ENDING, MOST_ENDINGS, REST_STEPS, STANDSTILL, RestDetector
 
 STEPS, SPEED = 60, 0.02
 END = STEPS * SPEED
@@ -34,7 +33,7 @@ def window(place: float, movement: float = 0.0) -> torch.Tensor:
 @pytest.mark.parametrize(("share", "rests"), [(0.0, True), (0.99, True), (1.01, False), (3.0, False)])
 def test_a_rest_is_far_less_movement_than_demonstrations_ever_made_on_their_way(waits, share, rests):
     rest = detector(demonstration((STEPS, SPEED), (waits, 0.0)))
-    assert rest.detects(window(END / 2, share * LEAST_PROGRESS * LEAST)) == rests
+    assert rest.detects(window(END / 2, share * STANDSTILL * LEAST)) == rests
 
 
 @pytest.mark.parametrize(("off", "rests"), [(0.0, False), (0.99, False), (1.01, True)])
@@ -54,10 +53,10 @@ def test_how_far_a_demonstration_led_is_what_counts_also_if_it_came_back():
 def test_to_and_fro_is_no_rest():
     rest = detector(demonstration((STEPS, SPEED)))
     swinging = window(END / 2)
-    swinging[::2, 0] += 1.01 * LEAST_PROGRESS * LEAST
+    swinging[::2, 0] += 1.01 * STANDSTILL * LEAST
     assert not rest.detects(swinging)
     swinging[:, 0] = END / 2
-    swinging[7, 1] += 1.01 * LEAST_PROGRESS * LEAST
+    swinging[7, 1] += 1.01 * STANDSTILL * LEAST
     assert not rest.detects(swinging)
 
 
@@ -67,8 +66,8 @@ def test_after_demonstrations_that_paused_for_as_long_no_standstill_is_a_rest():
         assert not detector(*demonstrations).detects(window(END / 2))
     shorter = demonstration((30, SPEED), (REST_STEPS // 2, 0.0), (30, SPEED))
     rest = detector(moving, shorter)
-    assert rest.detects(window(END / 2, 0.99 * LEAST_PROGRESS * LEAST / 2))
-    assert not rest.detects(window(END / 2, 1.01 * LEAST_PROGRESS * LEAST / 2))
+    assert rest.detects(window(END / 2, 0.99 * STANDSTILL * LEAST / 2))
+    assert not rest.detects(window(END / 2, 1.01 * STANDSTILL * LEAST / 2))
 
 
 @pytest.mark.parametrize("lengths", [(), (REST_STEPS - 1,), (STEPS, REST_STEPS - 1), (0,)])
