@@ -12,7 +12,7 @@ from ..analysis.evaluation_table import EvaluationRow, InterferenceRow, Protocol
 
 EXECUTORS = ("local", "slurm")
 NAME_CHARACTERS = set(string.ascii_letters + string.digits + "_-")
-DEMONSTRATED = ("kinds", "episodes_per_kind", "num_steps", "door_offset")
+DEMONSTRATED = ("kinds", "episodes_per_kind", "matched", "num_steps", "door_offset")
 """Options that choose the demonstrations to record."""
 
 
@@ -46,7 +46,10 @@ class ProtocolConfig:
         kinds (`tuple[str, ...]`, *optional*, defaults to `("push", "pull", "slide")`):
             Kinds of door, in demonstrations and trials.
         episodes_per_kind (`int`, *optional*, defaults to `5`):
-            Matched demonstrations for each kind of door.
+            Demonstrations for each kind of door.
+        matched (`bool`, *optional*, defaults to `True`):
+            Whether the kinds share start poses, door positions and timing, as one would have them. Unmatched, as a
+            human's are, each demonstration has its own, and they may tell one kind from another.
         num_steps (`int`, *optional*, defaults to `150`):
             Steps of a demonstration; the demonstrator needs up to 102, or 99 without sliding doors.
         door_offset (`float`, *optional*, defaults to `0.0`):
@@ -83,6 +86,7 @@ class ProtocolConfig:
     policy_flags: dict[str, Any] = field(default_factory=dict)
     kinds: tuple[str, ...] = KINDS
     episodes_per_kind: int = 5
+    matched: bool = True
     num_steps: int = 150
     door_offset: float = 0.0
     output_dir: Path = Path("outputs/protocol")

@@ -38,6 +38,7 @@ def record_missing(protocol: ProtocolConfig, runner: Runner) -> None:
                 f"--root={root}",
                 f"--episodes_per_kind={protocol.episodes_per_kind}",
                 f"--kinds=[{','.join(protocol.kinds)}]",
+                f"--matched={str(protocol.matched).lower()}",
                 f"--num_steps={protocol.num_steps}",
                 f"--door_offset={protocol.door_offset}",
                 f"--resume={str(root.exists()).lower()}",
@@ -54,7 +55,8 @@ def _complete(protocol: ProtocolConfig) -> bool:
     if not (root / PROVENANCE_PATH).exists():
         return True
     recorded = json.loads((root / PROVENANCE_PATH).read_text())["settings"]
-    wanted = {"kinds": list(protocol.kinds), "num_steps": protocol.num_steps, "door_offset": protocol.door_offset}
+    wanted = {name: getattr(protocol, name) for name in ("matched", "num_steps", "door_offset")}
+    wanted["kinds"] = list(protocol.kinds)
     for name, asked in wanted.items():
         if recorded.get(name) != asked:
             raise ValueError(

@@ -51,7 +51,7 @@ class FakeRunner(Runner):
 
     def record(self, flags):
         make_dataset(Path(flags["root"]))
-        settings = {name: yaml.safe_load(flags[name]) for name in ("kinds", "num_steps", "door_offset")}
+        settings = {name: yaml.safe_load(flags[name]) for name in ("kinds", "matched", "num_steps", "door_offset")}
         (Path(flags["root"]) / PROVENANCE_PATH).write_text(json.dumps({"settings": settings}))
 
     def train(self, flags):
@@ -288,7 +288,7 @@ def test_missing_demonstrations_are_recorded_once(hinged):
     ((name, flags),) = runner.commands
     assert name == "ufrnn"
     assert (flags["episodes_per_kind"], flags["kinds"], flags["num_steps"]) == ("15", "[push,pull]", "100")
-    assert (flags["door_offset"], flags["resume"]) == ("0.05", "false")
+    assert (flags["door_offset"], flags["matched"], flags["resume"]) == ("0.05", "true", "false")
 
 
 @pytest.mark.parametrize(
@@ -297,6 +297,7 @@ def test_missing_demonstrations_are_recorded_once(hinged):
         ("kinds", KINDS, r"recorded with kinds=\['push', 'pull'\], now --kinds=\['push', 'pull', 'slide'\] is"),
         ("num_steps", 150, "recorded with num_steps=100, now --num_steps=150 is asked for. Ask for what was"),
         ("door_offset", 0.0, "recorded with door_offset=0.05"),
+        ("matched", False, "recorded with matched=True, now --matched=False"),
         ("episodes_per_kind", 7, "There are 15 demonstrations in .*, more than the 14 of --episodes_per_kind=7"),
     ],
 )
