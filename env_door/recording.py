@@ -1,8 +1,8 @@
 """Record the scripted expert into a LeRobotDataset.
 
 Demonstrations are matched by default: the kinds share their seeds for start pose, door position and timing, so that
-nothing before the first opening motion tells which door it is. A policy trained on unmatched demonstrations learns
-such accidents, "knows" its door and tries no other.
+nothing before the first opening motion tells which door it is. A policy trained on unmatched demonstrations may learn
+such accidents, "know" its door and try no other.
 
 The episodes that share a seed are saved together, in one atomic step (see [`~env_door.staging`]): whatever stops a
 recording, the dataset on disk is readable and holds whole, matched episodes.
