@@ -77,8 +77,8 @@ class UFRNNConfig(PreTrainedConfig):
         recall_memory (`float`, *optional*, defaults to `200.0`):
             Steps in which the memory of a failed try fades to 1/e; 0 forgets at once.
         recall_at_rest (`bool`, *optional*, defaults to `True`):
-            Whether it also goes back when the arm has come to rest where no demonstration ended (see `rest.py`). It
-            never does where a demonstration paused on its way for 20 steps.
+            Whether it also goes back when the arm has come to rest where no demonstration began or ended (see
+            `rest.py`). It never does if a demonstration paused on its way for 20 steps.
 
         joint_hidden_dim (`int`, *optional*, defaults to `50`):
             Hidden size of `LSTM_joint`.

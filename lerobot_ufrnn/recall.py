@@ -7,8 +7,8 @@ standard deviation. Recall, our addition to the paper, acts on it, at run time o
 
 1. **Surprised?** The squared prediction error of the joints in units of the predicted variance, one on average while
    all goes as foreseen, is smoothed over a few steps and compared with a threshold. It counts only while the arm does
-   not make the foreseen movement: one that lags under a load is not wrong. A rest where no demonstration ended counts
-   as a surprise, too, even if it was foreseen (`rest.py`).
+   not make the foreseen movement: one that lags under a load is not wrong. A rest where no demonstration began or
+   ended counts as a surprise, too, even if it was foreseen (`rest.py`).
 2. **Go back.** The arm returns to its pose of the last moment before the surprise. What it was doing is refuted.
 3. **Imagine.** Copies of that moment imagine to sense something other than expected, by as much as the network was
    uncertain of it, and play their futures to a long horizon, in closed loop (`alternatives.py`).
@@ -127,7 +127,7 @@ class Recall:
         memory (`float`):
             Steps in which the memory of a failed try fades to 1/e; 0 forgets at once.
         rest (`RestDetector`, *optional*):
-            Tells a rest that is none of a demonstration's end; without it only surprise makes an episode go back.
+            Tells a rest that no demonstration shows; without it only surprise makes an episode go back.
     """
 
     def __init__(

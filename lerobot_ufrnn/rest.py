@@ -1,8 +1,8 @@
-"""Rest: has the arm come to a standstill where no demonstration ended?
+"""Rest: has the arm come to a standstill where no demonstration began or ended?
 
 Where demonstrations part, a network that has learned both ways can be led to the mean of them. If they are opposites,
-that is no movement at all, and it is foreseen: nothing surprises. But demonstrations rest at their ends only; where
-one paused on its way for as long, a rest tells nothing, and none is detected.
+that is no movement at all, and it is foreseen: nothing surprises. But demonstrations rest before they begin and after
+they end only; where one paused on its way for as long, a rest tells nothing, and none is detected.
 """
 
 import torch
@@ -14,28 +14,28 @@ REST_STEPS = 20
 STANDSTILL = 0.15
 """Share of the least that demonstrations moved in as many steps below which an arm stands still."""
 
-MOST_ENDINGS = 64
-"""Remembered ends of demonstrations; of more, those that differ most."""
+MOST_PLACES = 64
+"""Remembered places where demonstrations began or ended; of more, those that differ most."""
 
-AT_AN_ENDING = 0.15
-"""Distance from the end of a demonstration that is still at its end, as a fraction of how far it has led."""
+NEAR = 0.15
+"""Distance from such a place that is still there, as a fraction of how far demonstrations led."""
 
 
 class RestDetector(nn.Module):
-    """Remembers where demonstrations ended and the least that they moved elsewhere. Saved with the checkpoint.
+    """Remembers where demonstrations began and ended and the least that they moved elsewhere; saved in the checkpoint.
 
     Args:
         joint_dim (`int`):
             Number of joints D_j.
     """
 
-    endings: Tensor
+    places: Tensor
     extent: Tensor
     least_movement: Tensor
 
     def __init__(self, joint_dim: int):
         super().__init__()
-        self.register_buffer("endings", torch.zeros(MOST_ENDINGS, joint_dim))
+        self.register_buffer("places", torch.zeros(MOST_PLACES, joint_dim))
         self.register_buffer("extent", torch.zeros(()))
         self.register_buffer("least_movement", torch.zeros(()))
 
@@ -47,33 +47,33 @@ class RestDetector(nn.Module):
             joints (`Tensor`):
                 Its scaled measured joints, (L, D_j).
         """
-        ending = joints[-1:]
-        distances = (joints - ending).norm(dim=-1)
+        both = joints[[0, -1]]
         is_first = not self.extent > 0
-        self.endings.copy_(_most_different(ending if is_first else torch.cat((self.endings, ending)), MOST_ENDINGS))
-        self.extent.copy_(torch.maximum(self.extent, distances.max()))
+        self.places.copy_(_most_different(both if is_first else torch.cat((self.places, both)), MOST_PLACES))
+        self.extent.copy_(torch.maximum(self.extent, (joints - joints[-1]).norm(dim=-1).max()))
         # A demonstration too short to tell counts as one that rests, so that nothing else does.
         least = joints.new_zeros(())
         if len(joints) > REST_STEPS:
-            elsewhere = distances[REST_STEPS:] > AT_AN_ENDING * self.extent
+            distances = (joints[:, None] - both).norm(dim=-1).amin(-1)
+            elsewhere = distances.unfold(0, REST_STEPS + 1, 1).amin(-1) > NEAR * self.extent
             movements = _movement(joints.unfold(0, REST_STEPS + 1, 1).movedim(-1, 0))[elsewhere]
             if len(movements) > 0:
                 least = movements.min()
         self.least_movement.copy_(least if is_first else torch.minimum(self.least_movement, least))
 
     def detects(self, joints: Tensor) -> bool:
-        """Whether the arm rests where no demonstration ended.
+        """Whether the arm rests where no demonstration began or ended.
 
         Args:
             joints (`Tensor`):
                 Scaled measured joints of the last `REST_STEPS` + 1 steps, (REST_STEPS + 1, D_j).
 
         Returns:
-            `bool`: whether it moved far less than any demonstration did in as many steps, and is at no ending.
+            `bool`: whether it moved far less than any demonstration did in as many steps, and is at no such place.
         """
         if not bool(_movement(joints) < STANDSTILL * self.least_movement):
             return False
-        return bool((self.endings - joints[-1]).norm(dim=-1).min() > AT_AN_ENDING * self.extent)
+        return bool((self.places - joints[-1]).norm(dim=-1).min() > NEAR * self.extent)
 
 
 def _movement(joints: Tensor) -> Tensor:

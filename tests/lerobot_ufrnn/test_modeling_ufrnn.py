@@ -286,16 +286,16 @@ def test_training_holds_the_last_moment_on(dataset):
     assert torch.equal(commands, policy.joint_scaler.scale(episode.actions[-1]).expand(3, -1))
 
 
-def test_training_remembers_where_each_demonstration_ended_and_a_checkpoint_keeps_it(dataset, tmp_path):
+def test_training_remembers_where_each_demonstration_began_and_ended_and_a_checkpoint_keeps_it(dataset, tmp_path):
     policy = make_policy(small_config(), ds_meta=dataset.meta)
     policy.eval().forward(batch_of(0))
-    assert not policy.rest.endings.any()  # only training learns
+    assert not policy.rest.places.any()  # only training learns
     train(policy, [batch_of(0, 1), batch_of(1, 2)])
-    ends = torch.stack([policy.episodes[index].states[-1] for index in range(3)])
-    expected = {tuple(row) for row in policy.joint_scaler.scale(ends).tolist()}
+    both = torch.cat([policy.episodes[index].states[[0, -1]] for index in range(3)])
+    expected = {tuple(row) for row in policy.joint_scaler.scale(both).tolist()}
     policy.save_pretrained(tmp_path)
     for remembered in (policy, type(policy).from_pretrained(tmp_path)):
-        assert {tuple(row) for row in remembered.rest.endings.tolist()} == expected
+        assert {tuple(row) for row in remembered.rest.places.tolist()} == expected
 
 
 @pytest.mark.parametrize("at_rest", [True, False])
@@ -303,9 +303,9 @@ def test_a_policy_goes_back_from_a_rest_unless_told_not_to(dataset, at_rest):
     policy = make_policy(small_config(recall_at_rest=at_rest, surprise_threshold=1e9), ds_meta=dataset.meta)
     train(policy, [batch_of(0, 1, 2)] * 3)
     line = torch.linspace(0, 5, 100).unsqueeze(1).expand(-1, 3)
-    policy.rest.observe(line)  # it went far, and its end is far from all that follows
+    policy.rest.observe(line)  # it went far from all that follows
     policy.rest.least_movement.copy_(torch.tensor(1.0))
-    policy.rest.endings.copy_(line[-1:])
+    policy.rest.places.copy_(line[-1:])
     policy.eval().reset()
     still = observation(2)
     for _ in range(REST_STEPS + 1):

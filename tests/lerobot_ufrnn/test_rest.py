@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_ufrnn.rest import AT_AN_ENDING, MOST_ENDINGS, REST_STEPS, STANDSTILL, RestDetector
+from lerobot_ufrnn.rest import MOST_PLACES, NEAR, REST_STEPS, STANDSTILL, RestDetector
 
 STEPS, SPEED = 60, 0.02
 END = STEPS * SPEED
@@ -29,25 +29,26 @@ def window(place: float, movement: float = 0.0) -> torch.Tensor:
     return torch.stack((first, torch.full_like(first, 0.3)), dim=1)
 
 
-@pytest.mark.parametrize("waits", [0, 5, 50])
+@pytest.mark.parametrize("before", [0, 5, 50])
+@pytest.mark.parametrize("after", [0, 5, 50])
 @pytest.mark.parametrize(("share", "rests"), [(0.0, True), (0.99, True), (1.01, False), (3.0, False)])
-def test_a_rest_is_far_less_movement_than_demonstrations_ever_made_on_their_way(waits, share, rests):
-    rest = detector(demonstration((STEPS, SPEED), (waits, 0.0)))
+def test_a_rest_is_far_less_movement_than_demonstrations_ever_made_on_their_way(before, after, share, rests):
+    rest = detector(demonstration((before, 0.0), (STEPS, SPEED), (after, 0.0)))
     assert rest.detects(window(END / 2, share * STANDSTILL * LEAST)) == rests
 
 
 @pytest.mark.parametrize(("off", "rests"), [(0.0, False), (0.99, False), (1.01, True)])
-def test_where_a_demonstration_ended_an_arm_may_rest(off, rests):
+def test_where_a_demonstration_began_or_ended_an_arm_may_rest(off, rests):
     rest = detector(demonstration((STEPS, SPEED)), demonstration((STEPS, -SPEED)))
-    for way in (1, -1):
-        assert rest.detects(window(way * (END - off * AT_AN_ENDING * END))) == rests
-        assert rest.detects(window(way * (END + off * AT_AN_ENDING * END))) == rests
+    for place in (END, 0.0, -END):
+        for side in (1, -1):
+            assert rest.detects(window(place + side * off * NEAR * END)) == rests
 
 
 def test_how_far_a_demonstration_led_is_what_counts_also_if_it_came_back():
     rest = detector(demonstration((STEPS, SPEED), (STEPS, -SPEED)))
-    assert not rest.detects(window(0.99 * AT_AN_ENDING * END))
-    assert rest.detects(window(1.01 * AT_AN_ENDING * END))
+    assert not rest.detects(window(0.99 * NEAR * END))
+    assert rest.detects(window(1.01 * NEAR * END))
 
 
 def test_to_and_fro_is_no_rest():
@@ -82,18 +83,20 @@ def test_a_demonstration_seen_again_teaches_nothing_new():
     once, again = detector(*demonstrations), detector(*demonstrations, *reversed(demonstrations))
     assert once.extent == again.extent
     assert once.least_movement == again.least_movement
-    assert set(map(tuple, once.endings.tolist())) == set(map(tuple, again.endings.tolist()))
-    assert set(map(tuple, once.endings.tolist())) == {tuple(joints[-1].tolist()) for joints in demonstrations}
+    assert set(map(tuple, once.places.tolist())) == set(map(tuple, again.places.tolist()))
+    places = {tuple(joints[step].tolist()) for joints in demonstrations for step in (0, -1)}
+    assert set(map(tuple, once.places.tolist())) == places
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_of_very_many_endings_the_rare_ones_are_kept(first):
-    common = [demonstration((STEPS, SPEED + 1e-5 * number)) for number in range(2 * MOST_ENDINGS)]
+def test_of_very_many_places_the_rare_ones_are_kept(first):
+    common = [demonstration((STEPS, SPEED + 1e-5 * number)) for number in range(2 * MOST_PLACES)]
     rare = demonstration((STEPS, -SPEED))
     rest = detector(*((rare, *common) if first else (*common, rare)))
     assert not rest.detects(window(-END))
     assert not rest.detects(window(END))
-    assert rest.detects(window(0.0))
+    assert not rest.detects(window(0.0))
+    assert rest.detects(window(-END / 2))
 
 
 def test_what_was_observed_is_saved_with_the_weights():
