@@ -1,0 +1,61 @@
+"""One way to refuse a field of a configuration: what was given, and what is allowed."""
+
+import math
+from collections.abc import Iterable
+
+from draccus.utils import ParsingError
+
+
+def check_range(
+    config: object,
+    *names: str,
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    unit: str = "",
+) -> None:
+    """Refuses fields out of their range. A field of several numbers is checked one by one; none may be NaN or infinite.
+
+    Args:
+        config (`object`):
+            A configuration.
+        *names (`str`):
+            Its fields.
+        low (`float`, *optional*), high (`float`, *optional*):
+            Smallest and largest value allowed.
+        above (`float`, *optional*), below (`float`, *optional*):
+            Bounds that are not allowed themselves.
+        unit (`str`, *optional*, defaults to `""`):
+            Unit of the bounds, for the message.
+
+    Raises:
+        ParsingError: If a value is out of range (the parser of LeRobot's command lines hides a ValueError's text).
+    """
+    bounds = {"at least": low, "at most": high, "above": above, "below": below}
+    allowed = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if bound is not None) or "finite"
+    for name in names:
+        value = getattr(config, name)
+        for number in value if isinstance(value, Iterable) else (value,):
+            if not (
+                math.isfinite(number)
+                and (low is None or number >= low)
+                and (high is None or number <= high)
+                and (above is None or number > above)
+                and (below is None or number < below)
+            ):
+                raise ParsingError(f"`{name}` must be {allowed}{unit and ' ' + unit}, got {value}.")
+
+
+def check_pair(config: object, *names: str, strictly: bool = False) -> None:
+    """Refuses fields that are not two numbers in ascending order; `strictly` forbids equal ones, too."""
+    for name in names:
+        value = getattr(config, name)
+        if len(value) != 2 or not (value[0] < value[1] if strictly else value[0] <= value[1]):
+            raise ParsingError(f"`{name}` must hold two numbers, low {'<' if strictly else '<='} high, got {value}.")
+
+
+def check_choice(config: object, name: str, allowed: Iterable[str]) -> None:
+    """Refuses a field that is none of the values `allowed`."""
+    if getattr(config, name) not in (allowed := list(allowed)):
+        raise ParsingError(f"`{name}` must be one of {allowed}, got {getattr(config, name)!r}.")
