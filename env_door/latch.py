@@ -11,9 +11,12 @@ Three rules make the doors indistinguishable until somebody tries them:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
 
 KINDS = ("push", "pull", "slide")
 """Kinds of door, which are also the directions in which a robot can try to open one."""
@@ -26,17 +29,7 @@ LOAD_STEPS = 100
 
 
 def check_kinds(kinds: Sequence[str], option: str) -> None:
-    """Looks whether names are those of kinds of door, each once.
-
-    Args:
-        kinds (`Sequence[str]`):
-            The names.
-        option (`str`):
-            What the user set them with, for the message.
-
-    Raises:
-        ValueError: If they are not; says what is allowed.
-    """
+    """Raises ValueError unless the names are those of kinds of door, each once; `option` is what the user set."""
     if not kinds or sorted(kinds) != sorted(set(kinds) & set(KINDS)):
         raise ValueError(f"{option} must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
 
@@ -80,13 +73,12 @@ class Latch:
 
     Args:
         model (`mujoco.MjModel`):
-            The scene. The ranges of the panel's joints are changed when the door is freed and restored by
-            `reset`.
+            The scene. The ranges of the panel's joints are changed when the door is freed and restored by `reset`.
         data (`mujoco.MjData`):
             Its state.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+    def __init__(self, model: "mujoco.MjModel", data: "mujoco.MjData"):
         self._model = model
         self._data = data
         joints = ("slide", "hinge")
@@ -99,15 +91,7 @@ class Latch:
         self.reset("push")
 
     def reset(self, kind: str) -> None:
-        """Closes and locks the door, and makes it one of the given kind. Call after `mujoco.mj_resetData`.
-
-        Args:
-            kind (`str`):
-                One of `KINDS`.
-
-        Raises:
-            ValueError: If the kind is unknown.
-        """
+        """Closes and locks the door, and makes it one of the given kind. Call after `mujoco.mj_resetData`."""
         if kind not in KINDS:
             raise ValueError(f"kind={kind!r} is unknown; choose one of {KINDS}")
         self.kind = kind
@@ -150,21 +134,13 @@ class Latch:
         return self._held_steps > 0
 
     def load(self, direction: str) -> float:
-        """Load with which the robot works on a lock, as a fraction of the load that would free such a door.
-
-        Args:
-            direction (`str`):
-                One of `KINDS`.
-
-        Returns:
-            `float`: the fraction; negative when loaded the other way, 0 where that joint is not locked.
-        """
+        """Load with which the robot works on a lock, as a fraction of the load that would free such a door: negative when
+        loaded the other way, 0 where that joint is not locked."""
         opening = OPENINGS[direction]
         equality = self._lock[opening.joint]
         if not self._data.eq_active[equality]:
             return 0.0
-        # Every equality of the scene couples joints, which makes one constraint row each, in the order of
-        # their ids.
+        # Every equality of the scene couples joints, which makes one constraint row each, in the order of their ids.
         row = int(np.count_nonzero(self._data.eq_active[:equality]))
         return -opening.sign * float(self._data.efc_force[row]) / opening.break_load
 
@@ -214,8 +190,7 @@ class Latch:
     def _tried(self) -> str | None:
         """The direction in which the panel has been loaded past the threshold for long enough, if there is one."""
         loads = {direction: self.load(direction) for direction in KINDS}
-        # A sideways load on the knob also turns the hinge a little: the strongest load tells what is being
-        # tried.
+        # A sideways load on the knob also turns the hinge a little: the strongest load shows what is being tried.
         strongest = max(KINDS, key=loads.__getitem__)
         for direction in KINDS:
             tried = direction == strongest and loads[direction] >= 1.0
