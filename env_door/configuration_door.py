@@ -69,11 +69,7 @@ class DoorEnvConfig(EnvConfig):
     trial_log: str | None = None
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
-        default_factory=lambda: {
-            ACTION: ACTION,
-            "agent_pos": OBS_STATE,
-            "pixels/front": f"{OBS_IMAGES}.front",
-        }
+        default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "pixels/front": f"{OBS_IMAGES}.front"}
     )
 
     def __post_init__(self) -> None:
@@ -128,8 +124,8 @@ class DoorEnvConfig(EnvConfig):
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """Make the vector environments, one suite for each kind of door.
 
-        They are named `door_push`, `door_pull` and so on, because `lerobot-eval` reports its figures, names its videos and
-        labels its `per_group` results by suite. `use_async_envs` runs each environment in its own process.
+        They are named `door_push`, `door_pull` and so on, because `lerobot-eval` reports its figures, names its videos
+        and labels its `per_group` results by suite. `use_async_envs` runs each environment in its own process.
         """
         suites: dict[str, dict[int, Any]] = {}
         for kind in self.kinds:

@@ -39,8 +39,8 @@ class DoorEnv(gym.Env):
 
     ## Description
 
-    The door opens by pushing, pulling or sliding. Nothing that can be seen or felt says which until the knob is twisted and
-    the door is loaded in some direction; a wrong try leaves it shut.
+    The door opens by pushing, pulling or sliding. Nothing that can be seen or felt says which until the knob is twisted
+    and the door is loaded in some direction; a wrong try leaves it shut.
 
     ## Action Space
 
@@ -67,8 +67,8 @@ class DoorEnv(gym.Env):
 
     ## Starting State
 
-    The door is shut and the open gripper in front of the knob. The same seed gives the same start pose and door position
-    for every kind of door. `reset(options=...)` takes `kind` and `door_offset`, a fixed signed shift in m.
+    The door is shut and the open gripper in front of the knob. The same seed gives the same start pose and door
+    position for every kind of door. `reset(options=...)` takes `kind` and `door_offset`, a fixed signed shift in m.
 
     ## Episode End
 
@@ -288,8 +288,8 @@ class DoorEnv(gym.Env):
         self._renderers.clear()
 
     def _control(self, target: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-        # The target's own velocity is fed forward, so that a free arm follows closely although its gains are soft, and a
-        # gap between command and measurement means that something blocks it.
+        # The target's own velocity is fed forward, so that a free arm follows closely although its gains are soft, and
+        # a gap between command and measurement means that something blocks it.
         control = target + self._servo_lag * velocity
         control[..., -1] *= GRIPPER_STROKE
         return control
@@ -337,7 +337,7 @@ class DoorEnv(gym.Env):
 
 @contextlib.contextmanager
 def _as_value_error() -> Iterator[None]:
-    """What the checks of configurations raise for the parser of LeRobot's command lines, as Gymnasium's users expect it."""
+    """Gymnasium's users expect a ValueError where configurations raise what the parser of LeRobot's commands shows."""
     try:
         yield
     except ParsingError as error:

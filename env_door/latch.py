@@ -36,29 +36,18 @@ def check_kinds(kinds: Sequence[str], option: str) -> None:
 
 @dataclass(frozen=True)
 class Opening:
-    """How one kind of door opens.
-
-    Args:
-        joint (`str`):
-            The panel's joint that moves.
-        sign (`int`):
-            Which way it moves.
-        break_load (`float`):
-            Load that frees it, in N m (hinge) or N (slide).
-        threshold (`float`):
-            Travel in rad (hinge) or m (slide) that counts as open.
-        limit (`float`):
-            Travel at which the door meets its stop, in rad or m.
-        still_speed (`float`):
-            Speed in rad/s or m/s below which the door counts as nearly still.
-    """
+    """How one kind of door opens: by which joint of the panel, and which way. Hinges count in rad, slides in m."""
 
     joint: str
     sign: int
     break_load: float
+    """Load that frees it, in N m (hinge) or N (slide)."""
     threshold: float
+    """Travel that counts as open."""
     limit: float
+    """Travel at which the door meets its stop."""
     still_speed: float
+    """Speed below which the door counts as nearly still."""
 
 
 OPENINGS = {
@@ -71,11 +60,7 @@ OPENINGS = {
 class Latch:
     """Locks of the panel of one scene.
 
-    Args:
-        model (`mujoco.MjModel`):
-            The scene. The ranges of the panel's joints are changed when the door is freed and restored by `reset`.
-        data (`mujoco.MjData`):
-            Its state.
+    Freeing the door changes the ranges of the panel's joints in the model; `reset` restores them.
     """
 
     def __init__(self, model: "mujoco.MjModel", data: "mujoco.MjData"):
@@ -106,36 +91,35 @@ class Latch:
 
     @property
     def unlatched(self) -> bool:
-        """`bool`: whether the knob is twisted far enough for the door to open."""
+        """Whether the knob is twisted far enough for the door to open."""
         return bool(self._data.qpos[self._knob] > UNLATCH_ANGLE)
 
     @property
     def travel(self) -> float:
-        """`float`: how far the door has moved its own way, in rad (hinge) or m (slide)."""
+        """How far the door has moved its own way, in rad (hinge) or m (slide)."""
         opening = OPENINGS[self.kind]
         return opening.sign * float(self._data.qpos[self._qpos[opening.joint]])
 
     @property
     def opening(self) -> float:
-        """`float`: travel as a fraction of the threshold: 0 closed, 1 far enough to count as open, more beyond it."""
+        """Travel as a fraction of the threshold: 0 closed, 1 far enough to count as open, more beyond it."""
         # A locked panel gives way by some 1e-5 rad, of which each kind would tell another part.
         return max(0.0, self.travel) / OPENINGS[self.kind].threshold if self.freed else 0.0
 
     @property
     def is_open(self) -> bool:
-        """`bool`: whether the door has opened past its threshold and is nearly still."""
+        """Whether the door has opened past its threshold and is nearly still."""
         opening = OPENINGS[self.kind]
         speed = abs(float(self._data.qvel[self._qvel[opening.joint]]))
         return self.opening >= 1.0 and speed <= opening.still_speed
 
     @property
     def held(self) -> bool:
-        """`bool`: whether somebody holds the panel where it is."""
+        """Whether somebody holds the panel where it is."""
         return self._held_steps > 0
 
     def load(self, direction: str) -> float:
-        """Load with which the robot works on a lock, as a fraction of the load that would free such a door: negative when
-        loaded the other way, 0 where that joint is not locked."""
+        """Load on a lock as a fraction of what would free such a door: negative the other way, 0 if it is not locked."""
         opening = OPENINGS[direction]
         equality = self._lock[opening.joint]
         if not self._data.eq_active[equality]:
@@ -148,14 +132,8 @@ class Latch:
         """Holds the panel where it is: interference by a person at the other side of the door.
 
         `attempts` stays the directions in which the shut door was tried. The ways other than its own in which a freed
-        door is loaded meanwhile, as strongly and as long as a try, go to `tried_while_held`.
-
-        Args:
-            num_steps (`int`):
-                Physics steps for which to hold it; replaces a hold that still lasts, 0 ends it.
-
-        Raises:
-            ValueError: If the number is negative.
+        door is loaded meanwhile, as strongly and as long as a try, go to `tried_while_held`. `num_steps` physics steps
+        replace a hold that still lasts; 0 ends it.
         """
         if num_steps < 0:
             raise ValueError(f"num_steps={num_steps} must not be negative")

@@ -1,4 +1,4 @@
-"""What the task fixes and what of it may be chosen: one place for environment, configurations and twin, without MuJoCo."""
+"""What the task fixes and what of it may be chosen, for environment, configurations and twin; imports no MuJoCo."""
 
 from env_door.checks import check_choice, check_range
 from env_door.scene import ARMS
@@ -20,15 +20,7 @@ MAX_HOLD = 60.0
 
 
 def check_door(config: object) -> None:
-    """Checks the fields that say how a door is set up.
-
-    Args:
-        config (`object`):
-            Has `arm`, `door_offset`, `start_variation`, `command_limit` and `hold_seconds`.
-
-    Raises:
-        ParsingError: If one of them is out of its range.
-    """
+    """Refuses (ParsingError) fields that say how a door is set up: arm, shift, start, limit of commands, hold."""
     check_choice(config, "arm", ARMS)
     check_range(config, "door_offset", low=0.0, high=MAX_OFFSET, unit="m")
     check_range(config, "start_variation", low=0.0, high=0.05, unit="m")

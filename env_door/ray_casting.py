@@ -11,16 +11,7 @@ FAR = 12.0
 
 
 class RayCastRenderer:
-    """Draws the visible geoms of a scene on the CPU.
-
-    Args:
-        model (`mujoco.MjModel`):
-            The scene; primitive geoms only.
-        camera (`str`):
-            Name of the camera.
-        size (`int`):
-            Height and width of the picture in pixels.
-    """
+    """Draws the visible geoms of a scene of primitive geoms on the CPU; takes what `make_renderer` takes."""
 
     def __init__(self, model: mujoco.MjModel, camera: str, size: int):
         self._model = model

@@ -1,9 +1,9 @@
 """Pictures of the scene, with whatever this machine can draw.
 
-How to draw is chosen at the first picture: what `MUJOCO_GL` names, or else EGL, OSMesa, or nothing at all, in which case
-pictures are ray-cast on the CPU. MuJoCo itself chooses once, while it is imported, and takes GLFW where nothing is set,
-which ends the process without a display. So its `Renderer` is not used here, but one of its OpenGL contexts; no variable
-needs to be set for that, and it does not matter who imported MuJoCo first.
+How is chosen at the first picture: what `MUJOCO_GL` names, or else EGL, OSMesa, or nothing at all, in which case
+pictures are ray-cast on the CPU. MuJoCo's own `Renderer` draws with what was chosen while MuJoCo was imported: GLFW
+where no variable was set, which ends the process without a display. So only MuJoCo's OpenGL contexts are used here; no
+variable needs to be set for them, and it does not matter who imported MuJoCo first.
 """
 
 import contextlib
@@ -36,8 +36,7 @@ def choose_backend() -> str:
     """How to draw here, found out without risk to the process.
 
     Returns:
-        `str`: `egl`, `osmesa`, `glfw`, `mujoco` (its own choice, where that is safe: macOS and Windows), or `disable` for
-        ray-casting.
+        `str`: `egl`, `osmesa`, `glfw`, `mujoco` (its own choice, safe on macOS and Windows), or `disable`: ray-casting.
 
     Raises:
         RuntimeError: If the user's own choice is EGL or OSMesa and that library does not work here.
@@ -103,24 +102,9 @@ class Renderer(Protocol):
 
 
 class OpenGLRenderer:
-    """Draws with OpenGL.
+    """Draws with OpenGL; takes what `make_renderer` takes, and what `choose_backend` returns."""
 
-    Args:
-        model (`mujoco.MjModel`):
-            The scene.
-        camera (`str`):
-            Name of the camera.
-        size (`int`):
-            Height and width of the picture in pixels.
-        smooth (`bool`, *optional*, defaults to `False`):
-            Whether to smooth edges, for people rather than for a policy.
-        backend (`str`, *optional*):
-            What `choose_backend` returns, which is the default.
-    """
-
-    def __init__(
-        self, model: mujoco.MjModel, camera: str, size: int, smooth: bool = False, backend: str | None = None
-    ):
+    def __init__(self, model: mujoco.MjModel, camera: str, size: int, smooth: bool = False, backend: str | None = None):
         self._context: Any = None
         self._drawing: mujoco.MjrContext | None = None
         self._model = model
@@ -192,8 +176,7 @@ def make_renderer(model: mujoco.MjModel, camera: str, size: int, smooth: bool = 
             Whether to smooth edges where OpenGL draws.
 
     Returns:
-        `Renderer`: an `OpenGLRenderer`, or a `RayCastRenderer` together with a warning where OpenGL does not
-        work.
+        `Renderer`: an `OpenGLRenderer`, or a `RayCastRenderer` and a warning where OpenGL does not work.
 
     Raises:
         RuntimeError: If the user set `MUJOCO_GL` to a library that does not work here.

@@ -3,7 +3,7 @@
 import os
 
 MIN_MUJOCO = "3.6"
-"""Lowest version that works, as pyproject.toml declares it: 3.4 cannot return the normals of rays, 3.5 is not tested."""
+"""Lowest version that the tests run on, as pyproject.toml declares it; 3.4 cannot return the normals of rays."""
 
 try:
     import mujoco

@@ -13,24 +13,17 @@ GRIPPER_STROKE = 0.085
 
 @dataclass(frozen=True)
 class Arm:
-    """What differs between the arms beyond their XML.
-
-    Args:
-        name (`str`):
-            The value that `DoorEnv(arm=...)` takes; also the name of the XML file.
-        joints (`tuple[str, ...]`):
-            Names of the arm's joints from base to wrist.
-        joint_speed (`tuple[float, ...]`):
-            Largest joint speeds that the maker states, in rad/s.
-        ready_pose (`tuple[float, ...]`):
-            Joint angles in rad with the open gripper in front of the knob; inverse kinematics starts here,
-            which keeps every plan on the same branch (elbow up).
-    """
+    """What differs between the arms beyond their XML."""
 
     name: str
+    """The value that `DoorEnv(arm=...)` takes; also the name of the XML file."""
     joints: tuple[str, ...]
+    """Names of the arm's joints from base to wrist."""
     joint_speed: tuple[float, ...]
+    """Largest joint speeds that the maker states, in rad/s."""
     ready_pose: tuple[float, ...]
+    """Joint angles in rad with the open gripper in front of the knob; inverse kinematics starts here, which keeps every
+    plan on the same branch (elbow up)."""
 
 
 UR5E = Arm(
