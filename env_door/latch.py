@@ -119,7 +119,7 @@ class Latch:
         return self._held_steps > 0
 
     def load(self, direction: str) -> float:
-        """Load on a lock as a fraction of what would free such a door: negative the other way, 0 if it is not locked."""
+        """Load on a lock as a fraction of what would free such a door: negative the other way, 0 if not locked."""
         opening = OPENINGS[direction]
         equality = self._lock[opening.joint]
         if not self._data.eq_active[equality]:

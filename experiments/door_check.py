@@ -30,7 +30,7 @@ class Run:
     """What one expert episode showed."""
 
     success_step: int | None
-    """Step at which the door was open; `None` if it never was, or if other directions than those asked for were tried."""
+    """Step at which the door was open; `None` if it never was, or if other directions than asked for were tried."""
     free_lag: float
     """Largest distance in rad between commanded and measured joints before the first try."""
     blocked_lag: float
