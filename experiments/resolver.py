@@ -1,8 +1,9 @@
 """Does this package install beside others? `python experiments/resolver.py` writes a table of it.
 
 Asks `uv pip compile` for an environment with this package and a partner, for each extra of LeRobot and for popular
-simulators and plug-ins, with Python 3.12 and 3.13. Nothing is installed; each answer takes seconds. Where there is none,
-LeRobot with the partner alone is asked, to tell whose fault it is.
+simulators and plug-ins, with Python 3.12 and 3.13. Nothing is installed; each answer takes seconds. Where there is
+none, LeRobot with the partner alone is asked, to tell whose fault it is. A yes may rest on an older version of the
+partner: the table names the chosen one.
 """
 
 import argparse
@@ -66,10 +67,12 @@ def resolve(uv: str, requirements: list[str], python: str) -> tuple[dict[str, st
 
 
 def reason(message: str) -> str:
-    """The end of uv's chain of conclusions, which names what clashes."""
-    conflicts = re.findall(r"(?:Because|And because|because) (.+?)(?=, we can conclude|\. And because|\.$|$)", message)
-    clash = [text for text in conflicts if "mujoco" in text] or conflicts or [message]
-    text = clash[-1].rsplit("dependencies: ", 1)[-1]
+    """What clashes: uv's hint if it gives one, else the last dependency of its chain of conclusions, best on MuJoCo."""
+    if "hint: " in message:
+        text = message.split("hint: ", 1)[1]
+    else:
+        facts = re.findall(r"[Bb]ecause (\S+ depends on \S+)", message) or [message]
+        text = ([fact for fact in facts if "mujoco" in fact] or facts)[-1]
     return text if len(text) < 200 else text[:197] + "..."
 
 
@@ -79,6 +82,7 @@ def row(uv: str, partner: str) -> dict[str, str]:
     for python in PYTHONS:
         chosen, message = resolve(uv, [f"lerobot_policy_ufrnn @ {ROOT.as_uri()}", partner], python)
         entry[f"Python {python}"] = "yes" if chosen else "no"
+        entry[f"its version ({python})"] = chosen.get(partner.split("[")[0], "")
         entry[f"MuJoCo ({python})"] = chosen.get("mujoco", "")
         if not chosen:
             alone, alone_message = resolve(uv, [f"lerobot=={version('lerobot')}", partner], python)
