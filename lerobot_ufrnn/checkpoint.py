@@ -27,7 +27,7 @@ def find_weights(path: str) -> Path:
         return folder / SAFETENSORS_SINGLE_FILE
     if folder.exists() or path.count("/") != 1 or path.startswith((".", "/", "~")):
         raise ValueError(
-            f"`autoencoder_path` must be a checkpoint folder or a Hub repository 'user/name', got '{path}'."
+            f"`autoencoder.path` must be a checkpoint folder or a Hub repository 'user/name', got '{path}'."
         )
     return Path(hf_hub_download(path, SAFETENSORS_SINGLE_FILE))
 

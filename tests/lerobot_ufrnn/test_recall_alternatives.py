@@ -7,8 +7,8 @@ import torch
 from oracle import Oracle
 from small_network import FEATURES, JOINTS, in_closed_loop, is_close, random_state, row_of, small_model
 
-from lerobot_ufrnn.alternatives import DEVIATION_STEPS, REFUTED, SAME_FUTURE, SOON, Alternatives
 from lerobot_ufrnn.networks import HiddenState, Prediction
+from lerobot_ufrnn.recall import DEVIATION_STEPS, REFUTED, SAME_FUTURE, SOON, Alternatives
 
 HORIZON = 9
 
@@ -33,8 +33,8 @@ def check_futures(found: Alternatives, begun: list[list[np.ndarray]]) -> None:
             assert is_close(found.states.at(step), future[step], row=copy)
             for ours, theirs in zip(found.predictions, expected, strict=True):
                 np.testing.assert_allclose(ours[step, copy], theirs, atol=1e-10)
-        np.testing.assert_allclose(found.starts[copy], predicted[0][0][:JOINTS], atol=1e-10)
-        np.testing.assert_allclose(found.ends[copy], predicted[-1][0][:JOINTS], atol=1e-10)
+        np.testing.assert_allclose(found.joints[0, copy], predicted[0][0][:JOINTS], atol=1e-10)
+        np.testing.assert_allclose(found.joints[-1, copy], predicted[-1][0][:JOINTS], atol=1e-10)
 
 
 # ── Imagining ─────────────────────────────────────────────────────────
@@ -64,9 +64,9 @@ def test_a_copy_senses_what_it_expects_and_its_own_multiples_of_the_predicted_de
 
 def test_a_generator_makes_it_reproducible():
     first, again, other = (imagine(noise=(0.5, 1.0), seed=seed)[1] for seed in (3, 3, 4))
-    assert torch.equal(first.ends, again.ends)
+    assert torch.equal(first.joints, again.joints)
     assert torch.equal(first.states.h_shared, again.states.h_shared)
-    assert not torch.equal(first.ends, other.ends)
+    assert not torch.equal(first.joints[-1], other.joints[-1])
 
 
 # ── Refuting ──────────────────────────────────────────────────────────

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_ufrnn.attempt import FIRST_STEPS, LEAD, LEAST_PROGRESS, PATIENCE, Attempt, Outcome, progress
 from lerobot_ufrnn.networks import HiddenState
+from lerobot_ufrnn.recall import FIRST_STEPS, LEAD, LEAST_PROGRESS, PATIENCE, Outcome, Plan, progress
 
 STEPS = 30
 UNTIL_BLOCKED = 1 + FIRST_STEPS + PATIENCE + 1
@@ -20,21 +20,21 @@ def on_the_line(place: float | torch.Tensor) -> torch.Tensor:
     return ORIGIN + place * DIRECTION
 
 
-def attempt_on_the_line(steps: int = STEPS) -> Attempt:
+def plan_on_the_line(steps: int = STEPS) -> Plan:
     """Two joints that are to go straight on; a hidden state is how many steps they have gone."""
     gone = torch.arange(steps + 1, dtype=torch.float64)[:, None]
-    return Attempt(HiddenState(*(gone for _ in HiddenState._fields)), on_the_line(gone), on_the_line(100))
+    return Plan(HiddenState(*(gone for _ in HiddenState._fields)), on_the_line(gone), on_the_line(100))
 
 
 class Arm:
-    """Calls an attempt with places on the line, and keeps which of its states it was at and what came out."""
+    """Calls a plan with places on the line, and keeps which of its states it was at and what came out."""
 
     def __init__(self, steps: int = STEPS):
-        self.attempt = attempt_on_the_line(steps)
+        self.plan = plan_on_the_line(steps)
         self.outcomes: list[Outcome] = []
 
     def goes_to(self, place: float, as_predicted: bool = False) -> Outcome:
-        self.outcomes.append(self.attempt.advance(on_the_line(place), as_predicted))
+        self.outcomes.append(self.plan.advance(on_the_line(place), as_predicted))
         return self.outcomes[-1]
 
     def stays_at(self, place: float, calls: int) -> list[Outcome]:
@@ -49,7 +49,7 @@ class Arm:
 
     @property
     def at(self) -> int:
-        return int(self.attempt.state.h_joint)
+        return int(self.plan.state.h_joint)
 
 
 # ── Progress ──────────────────────────────────────────────────────────
@@ -90,9 +90,9 @@ def test_where_nothing_was_asked_there_is_no_progress():
 def test_it_begins_with_the_first_state_wherever_the_arm_is():
     for place in (0.0, -20.0, 50.0):
         arm = Arm()
-        assert not arm.attempt.has_begun
+        assert not arm.plan.has_begun
         assert arm.goes_to(place, as_predicted=True) is Outcome.UNDER_WAY
-        assert arm.attempt.has_begun
+        assert arm.plan.has_begun
         assert arm.at == 0
 
 
@@ -101,7 +101,7 @@ def test_an_arm_that_follows_gets_one_state_after_the_other():
     for step in range(STEPS + 1):
         assert arm.goes_to(step, as_predicted=True) is Outcome.UNDER_WAY
         assert arm.at == step
-    assert all(values.shape == (1, 1) for values in arm.attempt.state)
+    assert all(values.shape == (1, 1) for values in arm.plan.state)
     assert arm.goes_to(STEPS, as_predicted=True) is Outcome.DONE
 
 
@@ -143,8 +143,8 @@ def test_an_arm_that_never_moves_is_blocked_as_soon_as_that_can_be_told(place):
 
 
 def test_an_arm_that_moves_sideways_is_blocked_like_one_that_stands():
-    attempt, sideways = attempt_on_the_line(), torch.tensor([0.04, 0.03], dtype=torch.float64)
-    outcomes = [attempt.advance(on_the_line(0) + call * sideways, False) for call in range(UNTIL_BLOCKED)]
+    plan, sideways = plan_on_the_line(), torch.tensor([0.04, 0.03], dtype=torch.float64)
+    outcomes = [plan.advance(on_the_line(0) + call * sideways, False) for call in range(UNTIL_BLOCKED)]
     assert outcomes == [Outcome.UNDER_WAY] * (UNTIL_BLOCKED - 1) + [Outcome.BLOCKED]
 
 
@@ -213,4 +213,4 @@ def test_an_arm_that_is_never_as_predicted_at_the_last_state_is_blocked(steps):
 
 
 def test_it_remembers_where_its_future_ends():
-    assert torch.equal(attempt_on_the_line().end, on_the_line(100))
+    assert torch.equal(plan_on_the_line().end, on_the_line(100))

@@ -2,18 +2,19 @@ import numpy as np
 import pytest
 import torch
 from oracle import Oracle
+from small_network import network_config
 
 from lerobot_ufrnn.networks import SHLSTM
 
 
-def make_network(command_head: bool = True) -> SHLSTM:
+def make_network(command_target: str = "action") -> SHLSTM:
     torch.manual_seed(0)
-    return SHLSTM(3, 4, 6, 5, 2, (-9.0, 3.0), command_head).double()
+    return SHLSTM(network_config(command_target=command_target)).double()
 
 
-@pytest.mark.parametrize("command_head", [True, False])
-def test_steps_and_predictions_equal_the_oracle(command_head):
-    network = make_network(command_head)
+@pytest.mark.parametrize("command_target", ["action", "next_state"])
+def test_steps_and_predictions_equal_the_oracle(command_target):
+    network = make_network(command_target)
     oracle = Oracle(network)
     inputs = torch.rand(9, 2, 7, dtype=torch.float64) * 1.6 - 0.8
     state = network.initial_state(2)

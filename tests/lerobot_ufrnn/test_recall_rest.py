@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_ufrnn.rest import MOST_PLACES, NEAR, REST_STEPS, STANDSTILL, RestDetector
+from lerobot_ufrnn.recall import MOST_PLACES, NEAR, REST_STEPS, STANDSTILL, RestDetector
 
 STEPS, SPEED = 60, 0.02
 END = STEPS * SPEED

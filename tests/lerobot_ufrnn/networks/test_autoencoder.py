@@ -1,14 +1,20 @@
 import pytest
 import torch
+from small import small_config
 from torchvision.transforms.v2.functional import resize
 
+from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig
 from lerobot_ufrnn.networks import ConvAutoencoder, ImageEncoder
 
 
+def make_autoencoder(size=(32, 32), feature_dim=4, channels=(4, 4), hidden_dim=8, first_stride=16) -> ConvAutoencoder:
+    return ConvAutoencoder(AutoencoderConfig(size, feature_dim, channels, first_stride, hidden_dim))
+
+
 @pytest.mark.parametrize("size", [(16, 16), (32, 32), (33, 47), (128, 128), (30, 64)])
-@pytest.mark.parametrize(("first_stride", "channels"), [(2, (4, 4, 4)), (16, (4, 4)), (16, (4,)), (5, (4, 4))])
+@pytest.mark.parametrize(("first_stride", "channels"), [(2, (4, 4, 4)), (8, (4, 4)), (16, (4,)), (5, (4, 4))])
 def test_reconstruction_has_the_size_of_the_image(size, first_stride, channels):
-    autoencoder = ConvAutoencoder(size, 4, channels, 8, first_stride)
+    autoencoder = make_autoencoder(size, 4, channels, 8, first_stride)
     features = autoencoder.encode(torch.rand(2, 3, *size))
     assert features.shape == (2, 4)
     assert (features.abs() <= 1).all()
@@ -17,7 +23,7 @@ def test_reconstruction_has_the_size_of_the_image(size, first_stride, channels):
 
 def test_the_first_reconstruction_is_the_background():
     images = torch.rand(6, 3, 32, 32)
-    autoencoder = ConvAutoencoder((32, 32), 4, (4, 4), 8)
+    autoencoder = make_autoencoder()
     autoencoder.fit_background(images)
     reconstruction = autoencoder.decode(autoencoder.encode(images))
     torch.testing.assert_close(reconstruction, images.mean(0).expand_as(images), atol=1e-5, rtol=0)
@@ -26,14 +32,14 @@ def test_the_first_reconstruction_is_the_background():
 def test_every_pixel_reaches_the_features():
     """Also those of the patches at the right and lower edges, which stick out of an image of this size."""
     torch.manual_seed(0)
-    autoencoder = ConvAutoencoder((17, 19), 8, (8,), 16)
+    autoencoder = make_autoencoder((17, 19), 8, (8,), 16)
     images = torch.rand(1, 3, 17, 19, requires_grad=True)
     autoencoder.encode(images).sum().backward()
     assert (images.grad.abs().sum(1) > 0).all()
 
 
 def test_a_first_stride_of_two_gives_the_layout_of_the_paper():
-    autoencoder = ConvAutoencoder((128, 128), 10, (64, 32, 16, 12, 8), 50, first_stride=2)
+    autoencoder = make_autoencoder((128, 128), 10, (64, 32, 16, 12, 8), 50, first_stride=2)
     weights = autoencoder.state_dict()
     assert weights["encoder.0.weight"].shape == (64, 3, 3, 3)
     assert weights["decoder.8.weight"].shape == (64, 3, 3, 3)
@@ -41,7 +47,7 @@ def test_a_first_stride_of_two_gives_the_layout_of_the_paper():
 
 
 def test_the_weights_are_laid_out_as_safetensors_stores_them():
-    assert all(weight.is_contiguous() for weight in ConvAutoencoder((32, 32), 4, (4, 4), 8).state_dict().values())
+    assert all(weight.is_contiguous() for weight in make_autoencoder().state_dict().values())
 
 
 @pytest.mark.parametrize("first_stride", [2, 16])
@@ -51,7 +57,7 @@ def test_it_learns_where_a_bright_square_is(first_stride):
     images = torch.zeros(24, 3, 32, 32)
     for index in range(24):
         images[index, :, 12:20, index : index + 8] = 1
-    autoencoder = ConvAutoencoder((32, 32), 3, (8, 8, 8), 16, first_stride)
+    autoencoder = make_autoencoder((32, 32), 3, (8, 8), 16, first_stride)
     autoencoder.fit_background(images)
     optimizer = torch.optim.Adam(autoencoder.parameters(), lr=3e-3)
     for _ in range(300):
@@ -63,7 +69,7 @@ def test_it_learns_where_a_bright_square_is(first_stride):
 
 
 def make_encoder() -> ImageEncoder:
-    encoder = ImageEncoder(("observation.images.a", "observation.images.b"), (32, 32), 4, (4, 4), 8)
+    encoder = ImageEncoder(("observation.images.a", "observation.images.b"), small_config().autoencoder)
     encoder.scaler.fit(torch.full((8,), -0.5), torch.full((8,), 0.5))
     return encoder
 
