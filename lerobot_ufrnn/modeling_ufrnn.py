@@ -355,21 +355,7 @@ def _frames_to_drop(lengths: list[int]) -> int:
 
 
 def _horizon_loss(prediction: Prediction, trace: ForesightTrace, horizon: int, mask: Tensor) -> Tensor:
-    """Teaches the step scalars at which imagined step the kept future was least uncertain.
-
-    Args:
-        prediction (`Prediction`):
-            Predictions over time, (B, L, ...).
-        trace (`ForesightTrace`):
-            What foresight saw at each of the L steps.
-        horizon (`int`):
-            Longest horizon T.
-        mask (`Tensor`):
-            Steps that exist, (B, L).
-
-    Returns:
-        `Tensor`: binary cross-entropy between `sigmoid(step)` and the fraction of the horizon, scalar.
-    """
+    """Teaches the step scalars at which imagined step of T the kept future was least uncertain, as a fraction of T."""
     assert trace.calmest is not None
     calmest = trace.calmest.gather(1, trace.chosen.unsqueeze(1)).squeeze(1)  # (L, B)
     target = (calmest / horizon).T.to(prediction.step)  # (B, L)
