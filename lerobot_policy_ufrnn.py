@@ -1,21 +1,37 @@
-"""LeRobot's discovery hook: importing this module registers our policy, environment, robot and teleoperators."""
+"""LeRobot's discovery hook: importing this module registers our policy, environment, robot and teleoperators.
 
-import logging
+It imports configurations only; policy and processors, and with them PyTorch networks, come when they are asked for.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 from env_door.configuration_door import DoorEnvConfig
 from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
 from lerobot_ufrnn.robots.ur5e_robotiq import UR5eRobotiqConfig
 from lerobot_ufrnn.teleoperators import KeyboardTwistConfig, SpaceMouseTwistConfig
 
-__all__ = ["DoorEnvConfig", "KeyboardTwistConfig", "SpaceMouseTwistConfig", "UFRNNConfig", "UR5eRobotiqConfig"]
+if TYPE_CHECKING:
+    from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
+    from lerobot_ufrnn.processor_ufrnn import make_ufrnn_pre_post_processors
+
+__all__ = [
+    "DoorEnvConfig",
+    "KeyboardTwistConfig",
+    "SpaceMouseTwistConfig",
+    "UFRNNConfig",
+    "UFRNNPolicy",
+    "UR5eRobotiqConfig",
+    "make_ufrnn_pre_post_processors",
+]
 
 
-def _keep_last_line(record: logging.LogRecord) -> bool:
-    if "torchcodec" in str(record.msg):
-        record.msg = str(record.msg).strip().splitlines()[-1].replace(" (see the error above)", "")
-    return True
+def __getattr__(name: str) -> Any:
+    if name == "UFRNNPolicy":
+        from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
 
+        return UFRNNPolicy
+    if name == "make_ufrnn_pre_post_processors":
+        from lerobot_ufrnn.processor_ufrnn import make_ufrnn_pre_post_processors
 
-# Where FFmpeg's libraries are missing, LeRobot falls back to PyAV, which this project uses anyway, but first prints
-# sixty lines of torchcodec's attempts; the last one says it all.
-logging.getLogger("lerobot.utils.import_utils").addFilter(_keep_last_line)
+        return make_ufrnn_pre_post_processors
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

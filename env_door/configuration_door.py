@@ -12,14 +12,11 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from env_door.env import MAX_HOLD, MAX_OFFSET, DoorEnv
+from env_door.checks import check_range
 from env_door.latch import KINDS
+from env_door.limits import EPISODE_STEPS, FPS, IMAGE_SIZE, check_door
 from env_door.scene import ARMS
 from env_door.trials import TrialLog
-
-FPS = DoorEnv.metadata["render_fps"]
-IMAGE_SIZE = 128
-"""Height and width in pixels of the images that a policy sees."""
 
 TASKS = (*KINDS, "random", "all")
 
@@ -52,27 +49,18 @@ class DoorEnvConfig(EnvConfig):
             Control steps a second. The environment runs at 10 Hz only.
         episode_length (`int`, *optional*, defaults to 300):
             Steps after which a trial is cut.
-        arm (`str`, *optional*, defaults to `"ur5e"`):
-            `"ur5e"` (7 values with the gripper) or `"panda"` (8).
-        door_offset (`float`, *optional*, defaults to 0.0):
-            Half-width, in metres, of the range from which the lateral shift of the door is drawn; 0 to 0.05.
-        start_variation (`float`, *optional*, defaults to 0.02):
-            Spread of the tool's start position, in metres.
-        command_limit (`float`, *optional*, defaults to 0.08):
-            Largest distance, in radians, of a joint command from the measured joint.
-        hold_seconds (`float`, *optional*, defaults to 0.0):
-            Time in seconds for which somebody holds the door still once it has begun to open; 0 to 60.
+        arm, door_offset, start_variation, command_limit, hold_seconds:
+            As in [`~env_door.env.DoorEnv`].
         trial_log (`str | None`, *optional*):
             File that gets one JSON line for every finished trial, see [`~env_door.trials.read_trials`].
 
     Raises:
-        ParsingError: If a field is out of its range (the parser of LeRobot's command lines hides the text of a
-            ValueError).
+        ParsingError: If a field is out of its range.
     """
 
     task: str | None = "all"
     fps: int = FPS
-    episode_length: int = 300
+    episode_length: int = EPISODE_STEPS
     arm: str = "ur5e"
     door_offset: float = 0.0
     start_variation: float = 0.02
@@ -81,11 +69,7 @@ class DoorEnvConfig(EnvConfig):
     trial_log: str | None = None
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
-        default_factory=lambda: {
-            ACTION: ACTION,
-            "agent_pos": OBS_STATE,
-            "pixels/front": f"{OBS_IMAGES}.front",
-        }
+        default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "pixels/front": f"{OBS_IMAGES}.front"}
     )
 
     def __post_init__(self) -> None:
@@ -93,20 +77,9 @@ class DoorEnvConfig(EnvConfig):
             raise ParsingError(
                 f"--env.task must be one of {', '.join(TASKS)}, or several kinds such as push,pull, got {self.task!r}."
             )
-        if self.fps != FPS:
-            raise ParsingError(f"--env.fps must be {FPS}, the rate of the environment, got {self.fps}.")
-        if self.episode_length < 1:
-            raise ParsingError(f"--env.episode_length must be at least 1 step, got {self.episode_length}.")
-        if self.arm not in ARMS:
-            raise ParsingError(f"--env.arm must be one of {', '.join(ARMS)}, got {self.arm!r}.")
-        if not 0 <= self.door_offset <= MAX_OFFSET:
-            raise ParsingError(f"--env.door_offset must be 0 to {MAX_OFFSET} m, got {self.door_offset}.")
-        if not 0 <= self.start_variation <= 0.05:
-            raise ParsingError(f"--env.start_variation must be 0 to 0.05 m, got {self.start_variation}.")
-        if not 0.01 <= self.command_limit <= 1.0:
-            raise ParsingError(f"--env.command_limit must be 0.01 to 1.0 rad, got {self.command_limit}.")
-        if not 0 <= self.hold_seconds <= MAX_HOLD:
-            raise ParsingError(f"--env.hold_seconds must be 0 to {MAX_HOLD} s, got {self.hold_seconds}.")
+        check_range(self, "fps", low=FPS, high=FPS, unit="Hz")
+        check_range(self, "episode_length", low=1, unit="step")
+        check_door(self)
         if self.max_parallel_tasks != 1:
             raise ParsingError(
                 f"--env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: drawing does not work in threads. "
@@ -151,17 +124,8 @@ class DoorEnvConfig(EnvConfig):
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """Make the vector environments, one suite for each kind of door.
 
-        The suites are named `door_push`, `door_pull` and so on, because `lerobot-eval` reports its figures, names
-        its videos and labels its `per_group` results by suite.
-
-        Args:
-            n_envs (`int`):
-                Number of environments that run side by side.
-            use_async_envs (`bool`, *optional*, defaults to `False`):
-                Run each environment in its own process.
-
-        Returns:
-            `dict[str, dict[int, gym.vector.VectorEnv]]`: `{suite: {0: vector environment}}`.
+        They are named `door_push`, `door_pull` and so on, because `lerobot-eval` reports its figures, names its videos
+        and labels its `per_group` results by suite. `use_async_envs` runs each environment in its own process.
         """
         suites: dict[str, dict[int, Any]] = {}
         for kind in self.kinds:
@@ -169,7 +133,7 @@ class DoorEnvConfig(EnvConfig):
             if use_async_envs and n_envs > 1:
                 # Imported once by the process that all others fork from, instead of by each of them: half a minute less
                 # for each kind of door. Python 3.12 does not preload the main script itself.
-                multiprocessing.set_forkserver_preload([__name__, "lerobot.scripts.lerobot_eval"])
+                multiprocessing.set_forkserver_preload(["env_door.env", __name__, "lerobot.scripts.lerobot_eval"])
                 # Lazy: the processes of one kind start only when its turn has come.
                 suites[f"door_{kind}"] = {0: _LazyAsyncVectorEnv([make] * n_envs)}
                 continue

@@ -15,46 +15,24 @@ TIMING_STREAM = 1  # keeps the expert's random numbers apart from those of the e
 
 @dataclass(frozen=True)
 class Demonstration:
-    """What was seen and commanded while the expert opened one door.
-
-    Args:
-        kind (`str`):
-            Kind of the door.
-        seed (`int`):
-            Seed of the environment and of the expert's timing.
-        images (`np.ndarray`):
-            Camera frames `(T, H, W, 3)`, uint8.
-        states (`np.ndarray`):
-            Measured joints `(T, D)` in radians, the gripper last in 0..1.
-        actions (`np.ndarray`):
-            Joint targets `(T, D)` applied at the frame of the same index.
-        branch_step (`int`):
-            First step whose action depends on the kind.
-        success_step (`int`):
-            First step after which the door counted as open.
-    """
+    """What was seen and commanded while the expert opened one door."""
 
     kind: str
     seed: int
-    images: np.ndarray
-    states: np.ndarray
-    actions: np.ndarray
+    images: np.ndarray  # (T, H, W, 3), uint8
+    states: np.ndarray  # (T, D), measured joints in rad, the gripper last in 0..1
+    actions: np.ndarray  # (T, D), joint targets applied at the frame of the same index
     branch_step: int
+    """First step whose action depends on the kind."""
     success_step: int
+    """First step after which the door counted as open."""
 
 
 def spread(seed: int) -> float:
-    """Where in its range a door may stand, so that a few demonstrations cover the range.
+    """Where in its range, -1 to 1, a door may stand, so that a few demonstrations cover the range.
 
     A few random positions leave gaps, in which a policy has seen nothing; who demonstrates spreads them. Those of
     successive seeds, from any one on, fall far from each other (the golden-ratio sequence, of low discrepancy).
-
-    Args:
-        seed (`int`):
-            Seed of the demonstration.
-
-    Returns:
-        `float`: from -1, the lower end of the range, to 1.
     """
     return 2 * ((0.5 + seed * GOLDEN_RATIO) % 1) - 1
 
@@ -79,7 +57,7 @@ def demonstrate(
             Where the door stands, in m; drawn by the environment if it is not given.
 
     Returns:
-        `Demonstration | None`: The demonstration, or `None` when the door did not open in time or was out of reach.
+        `Demonstration | None`: `None` when the door did not open in time or was out of reach.
 
     Raises:
         ValueError: If `num_steps` ends before the expert would have tried the door.
@@ -108,12 +86,5 @@ def demonstrate(
             success_step = step
     if success_step is None:
         return None
-    return Demonstration(
-        kind=kind,
-        seed=seed,
-        images=np.stack(images),
-        states=np.stack(states),
-        actions=np.stack(actions),
-        branch_step=expert.branch_step,
-        success_step=success_step,
-    )
+    frames = np.stack(images), np.stack(states), np.stack(actions)
+    return Demonstration(kind, seed, *frames, expert.branch_step, success_step)

@@ -1,25 +1,25 @@
 """The Gymnasium environment: an arm in front of a door whose kind it must find out by trying."""
 
+import contextlib
+from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
+from draccus.utils import ParsingError
 from numpy.typing import NDArray
 
+from env_door.checks import check_choice, check_range
 from env_door.kinematics import InverseKinematics
 from env_door.latch import KINDS, Latch
+from env_door.limits import FPS, IMAGE_SIZE, MAX_OFFSET, check_door
 from env_door.rendering import Renderer, make_renderer
 from env_door.scene import ARMS, GRIPPER_STROKE, load_model
+from env_door.simulator import mujoco
 
 CONTROL_STEPS = 50
 """Physics steps of 2 ms in one control step of 0.1 s."""
-
-MAX_OFFSET = 0.05
-"""Largest sideways shift of the door in metres."""
-
-MAX_HOLD = 60.0
-"""Longest time in seconds for which somebody holds the door."""
 
 HOLD_OPENING = 0.15
 """Opening, as a fraction of what counts as open, at which somebody holds the door: 60 mrad or 21 mm, seen to move."""
@@ -35,13 +35,51 @@ GRASP_ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 
 
 class DoorEnv(gym.Env):
-    """Door opening with an arm and a parallel gripper, at 10 Hz, from a camera and joint angles.
+    """Door opening with an arm and a parallel gripper, at 10 Hz.
 
-    The observation holds `pixels/front`, an image `(size, size, 3)` of `uint8`, and `agent_pos`, the measured
-    joint angles in rad followed by the gripper's closure (0 open, 1 closed) as `float32`. The action has the
-    layout of `agent_pos` and holds absolute targets. As on a real controller a target is limited to the joint
-    ranges, to the joint speeds and to a distance from the measured joints before the arm moves towards it
-    along a straight line.
+    ## Description
+
+    The door opens by pushing, pulling or sliding. Nothing that can be seen or felt says which until the knob is twisted
+    and the door is loaded in some direction; a wrong try leaves it shut.
+
+    ## Action Space
+
+    `Box` of `float32`, shape `(7,)` for the UR5e and `(8,)` for the Panda: absolute targets.
+
+    | Index | Target              | Unit | Range                |
+    |-------|---------------------|------|----------------------|
+    | 0..-2 | joint angles        | rad  | ranges of the joints |
+    | -1    | gripper's closure   | 1    | 0 open to 1 closed   |
+
+    As on a real controller a target is limited to the joint ranges, to the joint speeds and to a distance from the
+    measured joints before the arm moves towards it along a straight line.
+
+    ## Observation Space
+
+    | Key            | Shape             | Type      | What                                            |
+    |----------------|-------------------|-----------|-------------------------------------------------|
+    | `pixels/front` | `(size, size, 3)` | `uint8`   | the camera's picture                            |
+    | `agent_pos`    | as an action      | `float32` | measured joint angles and the gripper's closure |
+
+    ## Rewards
+
+    1 in a step after which the door is open and nearly still, else 0.
+
+    ## Starting State
+
+    The door is shut and the open gripper in front of the knob. The same seed gives the same start pose and door
+    position for every kind of door. `reset(options=...)` takes `kind` and `door_offset`, a fixed signed shift in m.
+
+    ## Episode End
+
+    Terminates when the door is open; truncated after 300 steps (`env_door/Door-v0`).
+
+    ## Info
+
+    `is_success`, `door_kind`, `opening` (0 closed, 1 open), `attempts` (directions in which the shut door was tried, in
+    order), `held` (somebody holds it now), `tried_while_held` (ways other than its own tried meanwhile).
+
+    ## Arguments
 
     Args:
         kind (`str`, *optional*, defaults to `"random"`):
@@ -54,21 +92,27 @@ class DoorEnv(gym.Env):
         start_variation (`float`, *optional*, defaults to `0.02`):
             Half-width in m, 0 to 0.05, of the range of the tool's start position along each axis.
         command_limit (`float`, *optional*, defaults to `0.08`):
-            Largest distance in rad between a joint target and the measured joint; keeps a blocked arm from
+            Largest distance in rad, 0.01 to 1, between a joint target and the measured joint; keeps a blocked arm from
             folding up.
         hold_seconds (`float`, *optional*, defaults to `0.0`):
             Seconds, 0 to 60, for which somebody on the other side holds the door still, once in a trial: from the
-            first control step that leaves it at least 15 % open. Meanwhile `info["held"]` is true, and
-            `info["tried_while_held"]` lists the ways other than its own that are tried. 0 lets the door be.
+            first control step that leaves it at least 15 % open. 0 lets the door be.
         observation_size (`int`, *optional*, defaults to `128`):
-            Height and width of the observed image in pixels.
+            Height and width of the observed image in pixels, 16 to 768.
         render_size (`int`, *optional*, defaults to `192`):
-            Height and width of the picture that `render` returns, at most 768.
+            Height and width of the picture that `render` returns, 16 to 768.
         render_mode (`str`, *optional*, defaults to `"rgb_array"`):
             Only `"rgb_array"`.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    ## Version History
+
+    * v0: the first.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium declares it so)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (Gymnasium declares it so)
     task = "open the door"
     task_description = "open the door"
 
@@ -80,21 +124,16 @@ class DoorEnv(gym.Env):
         start_variation: float = 0.02,
         command_limit: float = 0.08,
         hold_seconds: float = 0.0,
-        observation_size: int = 128,
+        observation_size: int = IMAGE_SIZE,
         render_size: int = 192,
         render_mode: str = "rgb_array",
     ):
-        _check_kind(kind)
-        if arm not in ARMS:
-            raise ValueError(f"arm={arm!r} is unknown; choose one of {sorted(ARMS)}")
-        _check_range("door_offset", door_offset, 0.0, MAX_OFFSET, "m")
-        _check_range("start_variation", start_variation, 0.0, 0.05, "m")
-        _check_range("command_limit", command_limit, 0.01, 1.0, "rad")
-        _check_range("hold_seconds", hold_seconds, 0.0, MAX_HOLD, "s")
-        _check_range("observation_size", observation_size, 16, 768, "pixels")
-        _check_range("render_size", render_size, 16, 768, "pixels")
-        if render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode={render_mode!r} is unknown; only 'rgb_array' is offered")
+        asked = SimpleNamespace(**{name: value for name, value in locals().items() if name != "self"})
+        with _as_value_error():
+            check_door(asked)
+            check_choice(asked, "kind", (*KINDS, "random"))
+            check_range(asked, "observation_size", "render_size", low=16, high=768, unit="pixels")
+            check_choice(asked, "render_mode", self.metadata["render_modes"])
         self.kind = kind
         self.arm = ARMS[arm]
         self.door_offset = door_offset
@@ -143,10 +182,9 @@ class DoorEnv(gym.Env):
 
         Args:
             seed (`int`, *optional*):
-                Seed of all draws. The same seed gives the same start pose and offset for every kind of door.
+                Seed of all draws.
             options (`dict`, *optional*):
-                May hold `kind` (`str`) and `door_offset` (`float`, a fixed signed shift in m, at most 0.05
-                either way).
+                May hold `kind` (`str`) and `door_offset` (`float`, at most 0.05 either way).
 
         Returns:
             `tuple[dict, dict]`: observation and info.
@@ -164,8 +202,10 @@ class DoorEnv(gym.Env):
         offset = options.pop("door_offset", drawn_offset)
         if options:
             raise ValueError(f"unknown reset options {sorted(options)}; 'kind' and 'door_offset' are known")
-        _check_kind(kind)
-        _check_range("door_offset", offset, -MAX_OFFSET, MAX_OFFSET, "m")
+        asked = SimpleNamespace(kind=kind, door_offset=offset)
+        with _as_value_error():
+            check_choice(asked, "kind", (*KINDS, "random"))
+            check_range(asked, "door_offset", low=-MAX_OFFSET, high=MAX_OFFSET, unit="m")
 
         mujoco.mj_resetData(self.model, self.data)
         self.latch.reset(drawn_kind if kind == "random" else kind)
@@ -199,16 +239,7 @@ class DoorEnv(gym.Env):
         return self._observation(), float(success), success, False, self._info()
 
     def advance(self, action: NDArray[np.float32]) -> None:
-        """Moves the scene as `step` does, but draws no picture: for planning and measuring.
-
-        Args:
-            action (`NDArray[np.float32]`):
-                As for `step`.
-
-        Raises:
-            ValueError: If the action has the wrong shape or is not finite.
-            RuntimeError: If the physics diverged.
-        """
+        """Moves the scene as `step` does, but draws no picture: for planning and measuring."""
         start, target = self._target, self.limit_action(action)
         velocity = (target - start) / (CONTROL_STEPS * self.model.opt.timestep)
         progress = np.arange(1, CONTROL_STEPS + 1)[:, None] / CONTROL_STEPS
@@ -219,18 +250,7 @@ class DoorEnv(gym.Env):
         self._check_physics()
 
     def limit_action(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        """The target that the controller really follows for an action.
-
-        Args:
-            action (`NDArray[np.float32]`):
-                As for `step`.
-
-        Returns:
-            `NDArray[np.float64]`: the action within joint ranges, joint speeds and `command_limit`.
-
-        Raises:
-            ValueError: If the action has the wrong shape or is not finite.
-        """
+        """The target that the controller really follows: within joint ranges, joint speeds and `command_limit`."""
         target = np.asarray(action, dtype=np.float64)
         if target.shape != self._target.shape:
             raise ValueError(f"action has shape {target.shape}; it must be {self._target.shape}: {self.joint_names}")
@@ -243,34 +263,18 @@ class DoorEnv(gym.Env):
         return target
 
     def measured_joints(self) -> NDArray[np.float64]:
-        """Measured joints.
-
-        Returns:
-            `NDArray[np.float64]`: joint angles in rad and the gripper's closure (0 open, 1 closed).
-        """
+        """Measured joint angles in rad and the gripper's closure (0 open, 1 closed)."""
         closure = self.data.qpos[self._fingers].sum() / GRIPPER_STROKE
         return np.append(self.data.qpos[self._qpos], closure)
 
     def hold_door(self, seconds: float) -> None:
-        """Holds the panel where it is for a while, then lets it go: interference.
-
-        Args:
-            seconds (`float`):
-                Simulated seconds, not negative.
-
-        Raises:
-            ValueError: If the time is negative or not finite.
-        """
+        """Holds the panel where it is for some simulated seconds, then lets it go: interference."""
         if not (np.isfinite(seconds) and seconds >= 0):
             raise ValueError(f"seconds={seconds!r} must be a number that is not negative")
         self.latch.hold(round(seconds / self.model.opt.timestep))
 
     def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
-        """Picture of the scene for people.
-
-        Returns:
-            `NDArray[np.uint8]`: picture, shape `(render_size, render_size, 3)`.
-        """
+        """Picture of the scene for people, shape `(render_size, render_size, 3)`."""
         # LeRobot asks a finished environment for its picture until its whole batch is done: draw only what moved.
         poses = np.concatenate([self.data.geom_xpos, self.data.geom_xmat], axis=1)
         if self._picture is None or not np.array_equal(poses, self._picture_poses):
@@ -284,8 +288,8 @@ class DoorEnv(gym.Env):
         self._renderers.clear()
 
     def _control(self, target: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-        # The target's own velocity is fed forward, so that a free arm follows closely although its gains are
-        # soft and a gap between command and measurement means that something blocks it.
+        # The target's own velocity is fed forward, so that a free arm follows closely although its gains are soft, and
+        # a gap between command and measurement means that something blocks it.
         control = target + self._servo_lag * velocity
         control[..., -1] *= GRIPPER_STROKE
         return control
@@ -331,11 +335,10 @@ class DoorEnv(gym.Env):
         return self._renderers[camera]
 
 
-def _check_kind(kind: str) -> None:
-    if kind not in (*KINDS, "random"):
-        raise ValueError(f"kind={kind!r} is unknown; choose one of {(*KINDS, 'random')}")
-
-
-def _check_range(name: str, value: float, low: float, high: float, unit: str) -> None:
-    if not low <= value <= high:
-        raise ValueError(f"{name}={value!r} is out of range; it must lie within {low} to {high} {unit}")
+@contextlib.contextmanager
+def _as_value_error() -> Iterator[None]:
+    """Gymnasium's users expect a ValueError where configurations raise what the parser of LeRobot's commands shows."""
+    try:
+        yield
+    except ParsingError as error:
+        raise ValueError(str(error)) from None

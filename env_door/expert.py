@@ -59,25 +59,16 @@ PHASE_STEPS = {
 
 @dataclass(frozen=True)
 class Waypoint:
-    """A tool pose told by how far each part of the task has gone.
-
-    Args:
-        shift (`NDArray[np.float64]`):
-            Tool position relative to the closed door's knob in m, before any opening motion, shape `(3,)`.
-        twist (`float`, *optional*, defaults to `0.0`):
-            Twist of the gripper about the knob's axis in rad.
-        gripper (`float`, *optional*, defaults to `0.0`):
-            Gripper target, 0 open to 1 closed.
-        travel (`float`, *optional*, defaults to `0.0`):
-            Opening motion along `direction`, in rad (push, pull) or m (slide).
-        direction (`str`, *optional*, defaults to `"push"`):
-            The direction in which `travel` counts.
-    """
+    """A tool pose told by how far each part of the task has gone."""
 
     shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    """Tool position relative to the closed door's knob in m, before any opening motion, shape `(3,)`."""
     twist: float = 0.0
+    """Twist of the gripper about the knob's axis in rad."""
     gripper: float = 0.0
+    """Gripper target, 0 open to 1 closed."""
     travel: float = 0.0
+    """Opening motion along `direction`, in rad (push, pull) or m (slide)."""
     direction: str = "push"
 
     def towards(self, end: "Waypoint", fraction: float) -> "Waypoint":
@@ -91,15 +82,7 @@ class Waypoint:
         )
 
     def pose(self, knob: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Tool pose in the world.
-
-        Args:
-            knob (`NDArray[np.float64]`):
-                Position of the closed door's knob in m, shape `(3,)`.
-
-        Returns:
-            `tuple[NDArray, NDArray]`: position in m `(3,)` and rotation matrix `(3, 3)`.
-        """
+        """Position `(3,)` and rotation matrix `(3, 3)` of the tool, given the position of the closed door's knob."""
         position = knob + self.shift
         rotation = rotation_about(np.array([1.0, 0.0, 0.0]), self.twist) @ GRASP_ROTATION
         if self.direction == "slide":
@@ -110,16 +93,13 @@ class Waypoint:
 
 
 class DoorExpert:
-    """Opens the door, after trying wrong directions first where told to.
+    """Opens the door, after trying wrong directions first where told to; knows the knob's place, but not the kind.
 
     Args:
         env (`DoorEnv`):
-            The unwrapped environment. The expert reads the knob's place from it, but not the kind of door.
+            The unwrapped environment.
         directions (`Sequence[str]`, *optional*, defaults to `("push",)`):
             Directions to try in order, each one of `KINDS`; the last one is carried through.
-
-    Raises:
-        ValueError: If there is no direction, or an unknown one.
     """
 
     def __init__(self, env: DoorEnv, directions: Sequence[str] = ("push",)):
@@ -134,10 +114,8 @@ class DoorExpert:
     def reset(self, rng: np.random.Generator) -> None:
         """Plans for the present start pose and door place; call after the environment's `reset`.
 
-        Args:
-            rng (`np.random.Generator`):
-                Draws the duration of every phase. The same number of draws is made before the first try
-                whatever the directions, so equal seeds give equal actions up to `branch_step`.
+        The duration of every phase is drawn from `rng`: as many draws before the first try whatever the directions, so
+        equal seeds give equal actions up to `branch_step`.
 
         Raises:
             UnreachableError: If the arm cannot reach a pose of the plan.
@@ -159,15 +137,7 @@ class DoorExpert:
                 self.branch_step = len(self._plan)
 
     def act(self) -> NDArray[np.float32]:
-        """Target for this control step.
-
-        Returns:
-            `NDArray[np.float32]`: joint targets in rad and gripper target; the last one again once the plan
-            is done.
-
-        Raises:
-            RuntimeError: If `reset` was not called.
-        """
+        """Action for this control step; the last one again once the plan is done."""
         if not self._plan:
             raise RuntimeError("the expert has no plan yet; call reset(rng) after the environment's reset")
         action = self._plan[min(self._step, len(self._plan) - 1)][1]
@@ -201,17 +171,7 @@ class DoorExpert:
 
 
 def ease(fraction: float, ramp: float = 0.25) -> float:
-    """Trapezoidal speed profile: even acceleration, cruise, even braking.
-
-    Args:
-        fraction (`float`):
-            Elapsed part of the duration, 0 to 1.
-        ramp (`float`, *optional*, defaults to `0.25`):
-            Part of the duration spent accelerating, and again braking.
-
-    Returns:
-        `float`: covered part of the way, 0 to 1.
-    """
+    """Covered part of the way after a part of the duration: even acceleration for `ramp`, cruise, even braking."""
     cruise = 1.0 / (1.0 - ramp)
     if fraction < ramp:
         return 0.5 * cruise * fraction**2 / ramp

@@ -1,7 +1,7 @@
-"""Inverse kinematics of the arm by damped least squares on the MuJoCo model.
+"""Kinematics of the arm on the MuJoCo model; importing this module imports no MuJoCo.
 
-Each iteration solves, for the pose error ``e`` (position and rotation vector, 6 values) and the Jacobian
-``J``,
+Inverse kinematics by damped least squares: each iteration solves, for the pose error ``e`` (position and rotation
+vector, 6 values) and the Jacobian ``J``,
 
     dq = J^T (J J^T + damping * I)^-1 e
 
@@ -10,9 +10,13 @@ the last iterations are exact. Steps have the smallest norm, so an arm with a sp
 needlessly either.
 """
 
-import mujoco
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import mujoco
 
 POSITION_TOLERANCE = 1e-5
 ROTATION_TOLERANCE = 1e-4
@@ -38,12 +42,11 @@ class InverseKinematics:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        joints: tuple[str, ...],
-        damping: float = 0.01,
-        max_iterations: int = 200,
+        self, model: "mujoco.MjModel", joints: tuple[str, ...], damping: float = 0.01, max_iterations: int = 200
     ):
+        import mujoco
+
+        self._mujoco = mujoco
         self._model = model
         self._data = mujoco.MjData(model)
         self._qpos = np.array([model.joint(name).qposadr[0] for name in joints])
@@ -64,8 +67,21 @@ class InverseKinematics:
             `tuple[NDArray, NDArray]`: position in m `(3,)` and rotation matrix `(3, 3)` in the world frame.
         """
         self._data.qpos[self._qpos] = joints
-        mujoco.mj_kinematics(self._model, self._data)
+        self._mujoco.mj_kinematics(self._model, self._data)
         return self._data.site_xpos[self._site].copy(), self._data.site_xmat[self._site].reshape(3, 3).copy()
+
+    def jacobian(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Velocity (m/s) and angular velocity (rad/s) of the tool, in the world frame, for each joint's speed.
+
+        Args:
+            joints (`NDArray[np.float64]`):
+                Joint angles in rad, shape `(num_joints,)`.
+
+        Returns:
+            `NDArray[np.float64]`: the Jacobian, shape `(6, num_joints)`.
+        """
+        self.forward(joints)
+        return self._jacobian_here()
 
     def solve(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], start: NDArray[np.float64]
@@ -87,17 +103,13 @@ class InverseKinematics:
             UnreachableError: If no solution is found.
         """
         joints = np.array(start, dtype=np.float64)
-        jacobian_position = np.zeros((3, self._model.nv))
-        jacobian_rotation = np.zeros((3, self._model.nv))
         for _ in range(self._max_iterations):
             reached, orientation = self.forward(joints)
             error = np.concatenate([position - reached, rotation_vector(rotation @ orientation.T)])
             position_error, rotation_error = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
             if position_error < POSITION_TOLERANCE and rotation_error < ROTATION_TOLERANCE:
                 return joints
-            mujoco.mj_comPos(self._model, self._data)
-            mujoco.mj_jacSite(self._model, self._data, jacobian_position, jacobian_rotation, self._site)
-            jacobian = np.vstack([jacobian_position, jacobian_rotation])[:, self._dofs]
+            jacobian = self._jacobian_here()
             damping = self._damping * (error @ error) + MIN_DAMPING
             step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), error)
             joints = np.clip(joints + np.clip(step, -0.3, 0.3), self._ranges[:, 0], self._ranges[:, 1])
@@ -107,17 +119,17 @@ class InverseKinematics:
             "move the target closer to the middle of the workspace, or start from another pose"
         )
 
+    def _jacobian_here(self) -> NDArray[np.float64]:
+        jacobian = np.zeros((6, self._model.nv))
+        self._mujoco.mj_comPos(self._model, self._data)
+        self._mujoco.mj_jacSite(self._model, self._data, jacobian[:3], jacobian[3:], self._site)
+        return jacobian[:, self._dofs]
+
 
 def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axis times angle (rad) of a rotation matrix.
+    """Axis times angle (rad) of a rotation matrix `(3, 3)`, shape `(3,)`."""
+    import mujoco
 
-    Args:
-        rotation (`NDArray[np.float64]`):
-            Rotation matrix `(3, 3)`.
-
-    Returns:
-        `NDArray[np.float64]`: rotation vector, shape `(3,)`.
-    """
     quaternion, vector = np.zeros(4), np.zeros(3)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
     mujoco.mju_quat2Vel(vector, quaternion, 1.0)
@@ -125,17 +137,9 @@ def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rotation_about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """Rotation matrix about a unit axis.
+    """Rotation matrix `(3, 3)` about a unit axis `(3,)` by an angle in rad."""
+    import mujoco
 
-    Args:
-        axis (`NDArray[np.float64]`):
-            Unit vector, shape `(3,)`.
-        angle (`float`):
-            Angle in rad.
-
-    Returns:
-        `NDArray[np.float64]`: rotation matrix `(3, 3)`.
-    """
     quaternion, matrix = np.zeros(4), np.zeros(9)
     mujoco.mju_axisAngle2Quat(quaternion, np.asarray(axis, dtype=np.float64), angle)
     mujoco.mju_quat2Mat(matrix, quaternion)

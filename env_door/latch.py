@@ -11,9 +11,12 @@ Three rules make the doors indistinguishable until somebody tries them:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
 
 KINDS = ("push", "pull", "slide")
 """Kinds of door, which are also the directions in which a robot can try to open one."""
@@ -26,46 +29,25 @@ LOAD_STEPS = 100
 
 
 def check_kinds(kinds: Sequence[str], option: str) -> None:
-    """Looks whether names are those of kinds of door, each once.
-
-    Args:
-        kinds (`Sequence[str]`):
-            The names.
-        option (`str`):
-            What the user set them with, for the message.
-
-    Raises:
-        ValueError: If they are not; says what is allowed.
-    """
+    """Raises ValueError unless the names are those of kinds of door, each once; `option` is what the user set."""
     if not kinds or sorted(kinds) != sorted(set(kinds) & set(KINDS)):
         raise ValueError(f"{option} must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
 
 
 @dataclass(frozen=True)
 class Opening:
-    """How one kind of door opens.
-
-    Args:
-        joint (`str`):
-            The panel's joint that moves.
-        sign (`int`):
-            Which way it moves.
-        break_load (`float`):
-            Load that frees it, in N m (hinge) or N (slide).
-        threshold (`float`):
-            Travel in rad (hinge) or m (slide) that counts as open.
-        limit (`float`):
-            Travel at which the door meets its stop, in rad or m.
-        still_speed (`float`):
-            Speed in rad/s or m/s below which the door counts as nearly still.
-    """
+    """How one kind of door opens: by which joint of the panel, and which way. Hinges count in rad, slides in m."""
 
     joint: str
     sign: int
     break_load: float
+    """Load that frees it, in N m (hinge) or N (slide)."""
     threshold: float
+    """Travel that counts as open."""
     limit: float
+    """Travel at which the door meets its stop."""
     still_speed: float
+    """Speed below which the door counts as nearly still."""
 
 
 OPENINGS = {
@@ -78,15 +60,10 @@ OPENINGS = {
 class Latch:
     """Locks of the panel of one scene.
 
-    Args:
-        model (`mujoco.MjModel`):
-            The scene. The ranges of the panel's joints are changed when the door is freed and restored by
-            `reset`.
-        data (`mujoco.MjData`):
-            Its state.
+    Freeing the door changes the ranges of the panel's joints in the model; `reset` restores them.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+    def __init__(self, model: "mujoco.MjModel", data: "mujoco.MjData"):
         self._model = model
         self._data = data
         joints = ("slide", "hinge")
@@ -99,15 +76,7 @@ class Latch:
         self.reset("push")
 
     def reset(self, kind: str) -> None:
-        """Closes and locks the door, and makes it one of the given kind. Call after `mujoco.mj_resetData`.
-
-        Args:
-            kind (`str`):
-                One of `KINDS`.
-
-        Raises:
-            ValueError: If the kind is unknown.
-        """
+        """Closes and locks the door, and makes it one of the given kind. Call after `mujoco.mj_resetData`."""
         if kind not in KINDS:
             raise ValueError(f"kind={kind!r} is unknown; choose one of {KINDS}")
         self.kind = kind
@@ -122,49 +91,40 @@ class Latch:
 
     @property
     def unlatched(self) -> bool:
-        """`bool`: whether the knob is twisted far enough for the door to open."""
+        """Whether the knob is twisted far enough for the door to open."""
         return bool(self._data.qpos[self._knob] > UNLATCH_ANGLE)
 
     @property
     def travel(self) -> float:
-        """`float`: how far the door has moved its own way, in rad (hinge) or m (slide)."""
+        """How far the door has moved its own way, in rad (hinge) or m (slide)."""
         opening = OPENINGS[self.kind]
         return opening.sign * float(self._data.qpos[self._qpos[opening.joint]])
 
     @property
     def opening(self) -> float:
-        """`float`: travel as a fraction of the threshold: 0 closed, 1 far enough to count as open, more beyond it."""
+        """Travel as a fraction of the threshold: 0 closed, 1 far enough to count as open, more beyond it."""
         # A locked panel gives way by some 1e-5 rad, of which each kind would tell another part.
         return max(0.0, self.travel) / OPENINGS[self.kind].threshold if self.freed else 0.0
 
     @property
     def is_open(self) -> bool:
-        """`bool`: whether the door has opened past its threshold and is nearly still."""
+        """Whether the door has opened past its threshold and is nearly still."""
         opening = OPENINGS[self.kind]
         speed = abs(float(self._data.qvel[self._qvel[opening.joint]]))
         return self.opening >= 1.0 and speed <= opening.still_speed
 
     @property
     def held(self) -> bool:
-        """`bool`: whether somebody holds the panel where it is."""
+        """Whether somebody holds the panel where it is."""
         return self._held_steps > 0
 
     def load(self, direction: str) -> float:
-        """Load with which the robot works on a lock, as a fraction of the load that would free such a door.
-
-        Args:
-            direction (`str`):
-                One of `KINDS`.
-
-        Returns:
-            `float`: the fraction; negative when loaded the other way, 0 where that joint is not locked.
-        """
+        """Load on a lock as a fraction of what would free such a door: negative the other way, 0 if not locked."""
         opening = OPENINGS[direction]
         equality = self._lock[opening.joint]
         if not self._data.eq_active[equality]:
             return 0.0
-        # Every equality of the scene couples joints, which makes one constraint row each, in the order of
-        # their ids.
+        # Every equality of the scene couples joints, which makes one constraint row each, in the order of their ids.
         row = int(np.count_nonzero(self._data.eq_active[:equality]))
         return -opening.sign * float(self._data.efc_force[row]) / opening.break_load
 
@@ -172,14 +132,8 @@ class Latch:
         """Holds the panel where it is: interference by a person at the other side of the door.
 
         `attempts` stays the directions in which the shut door was tried. The ways other than its own in which a freed
-        door is loaded meanwhile, as strongly and as long as a try, go to `tried_while_held`.
-
-        Args:
-            num_steps (`int`):
-                Physics steps for which to hold it; replaces a hold that still lasts, 0 ends it.
-
-        Raises:
-            ValueError: If the number is negative.
+        door is loaded meanwhile, as strongly and as long as a try, go to `tried_while_held`. `num_steps` physics steps
+        replace a hold that still lasts; 0 ends it.
         """
         if num_steps < 0:
             raise ValueError(f"num_steps={num_steps} must not be negative")
@@ -214,8 +168,7 @@ class Latch:
     def _tried(self) -> str | None:
         """The direction in which the panel has been loaded past the threshold for long enough, if there is one."""
         loads = {direction: self.load(direction) for direction in KINDS}
-        # A sideways load on the knob also turns the hinge a little: the strongest load tells what is being
-        # tried.
+        # A sideways load on the knob also turns the hinge a little: the strongest load shows what is being tried.
         strongest = max(KINDS, key=loads.__getitem__)
         for direction in KINDS:
             tried = direction == strongest and loads[direction] >= 1.0

@@ -12,20 +12,14 @@ PROVENANCE_PATH = Path("meta/door_recording.json")
 
 @dataclass
 class Provenance:
-    """Settings and seeds of a dataset.
-
-    Args:
-        settings (`dict`):
-            Options that all episodes share.
-        episodes (`list[dict]`):
-            `kind` and `seed` of each episode.
-        dropped_seeds (`list[int]`):
-            Seeds that were tried and not used.
-    """
+    """Settings and seeds of a dataset."""
 
     settings: dict[str, Any]
+    """Options that all episodes share."""
     episodes: list[dict[str, Any]] = field(default_factory=list)
+    """`kind` and `seed` of each episode."""
     dropped_seeds: list[int] = field(default_factory=list)
+    """Seeds that were tried and not used."""
 
     @property
     def next_seed(self) -> int:
@@ -36,13 +30,6 @@ class Provenance:
     @classmethod
     def open(cls, config: RecordConfig) -> "Provenance":
         """Read the provenance of the dataset to go on with, or start one.
-
-        Args:
-            config (`RecordConfig`):
-                What is to be recorded.
-
-        Returns:
-            `Provenance`: That of the episodes already in the folder.
 
         Raises:
             FileExistsError: If the folder holds something and `resume` is off.
@@ -60,8 +47,7 @@ class Provenance:
             provenance = cls(**json.loads((root / PROVENANCE_PATH).read_text()))
         except FileNotFoundError as error:
             raise ValueError(
-                f"{root} holds no recording of the door to go on with: {PROVENANCE_PATH} is missing. "
-                "Choose another root."
+                f"{root} holds no recording of the door: {PROVENANCE_PATH} is missing. Choose another root."
             ) from error
         for name, value in settings.items():
             if provenance.settings.get(name) != value:
@@ -72,10 +58,5 @@ class Provenance:
         return provenance
 
     def write(self, root: Path) -> None:
-        """Write the provenance into a dataset.
-
-        Args:
-            root (`Path`):
-                Folder of the dataset.
-        """
+        """Write the provenance into the dataset in a folder."""
         (root / PROVENANCE_PATH).write_text(json.dumps(asdict(self), indent=4))

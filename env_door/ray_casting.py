@@ -1,8 +1,9 @@
 """Pictures without OpenGL: one ray a pixel with MuJoCo's own collision code, flat shading by surface normal."""
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from env_door.simulator import mujoco
 
 SKY = np.array([0.76, 0.82, 0.87])
 LIGHT = np.array([-0.55, -0.5, 0.8]) / np.linalg.norm([-0.55, -0.5, 0.8])
@@ -10,16 +11,7 @@ FAR = 12.0
 
 
 class RayCastRenderer:
-    """Draws the visible geoms of a scene on the CPU.
-
-    Args:
-        model (`mujoco.MjModel`):
-            The scene; primitive geoms only.
-        camera (`str`):
-            Name of the camera.
-        size (`int`):
-            Height and width of the picture in pixels.
-    """
+    """Draws the visible geoms of a scene of primitive geoms on the CPU; takes what `make_renderer` takes."""
 
     def __init__(self, model: mujoco.MjModel, camera: str, size: int):
         self._model = model
@@ -37,15 +29,7 @@ class RayCastRenderer:
         self._glow = np.append(glow, 1.0)
 
     def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Picture of the current state.
-
-        Args:
-            data (`mujoco.MjData`):
-                State of the scene, after `mujoco.mj_forward` or a step.
-
-        Returns:
-            `NDArray[np.uint8]`: picture, shape `(size, size, 3)`.
-        """
+        """Picture of the state after `mujoco.mj_forward` or a step, shape `(size, size, 3)`."""
         count = self._size**2
         rotation = data.cam_xmat[self._camera].reshape(3, 3)
         rays = self._directions @ rotation.T

@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from env_door.demonstration import Demonstration, demonstrate, spread
 from env_door.env import DoorEnv
+from env_door.limits import FPS
 from env_door.provenance import Provenance
 from env_door.recording_config import ROBOT_TYPES, RecordConfig
 from env_door.staging import StagedDirectory
@@ -36,27 +37,17 @@ MAX_DROPS_IN_A_ROW = 20
 
 @dataclass
 class RecordReport:
-    """What a recording did.
-
-    Args:
-        root (`Path`):
-            Folder of the dataset.
-        episodes (`list[dict]`):
-            For each episode saved by this run its `episode_index`, `kind`, `seed`, `branch_step` (first step whose
-            action depends on the kind) and `success_step`.
-        total_episodes (`int`):
-            Episodes in the dataset, with those of earlier runs.
-        dropped_seeds (`list[int]`):
-            Seeds at which the expert failed at one kind, with those of earlier runs.
-        seconds (`float`):
-            Duration of this run.
-    """
+    """What a recording did."""
 
     root: Path
     episodes: list[dict[str, Any]] = field(default_factory=list)
+    """`episode_index`, `kind`, `seed`, `branch_step` and `success_step` of each episode that this run saved."""
     total_episodes: int = 0
+    """Episodes in the dataset, with those of earlier runs."""
     dropped_seeds: list[int] = field(default_factory=list)
+    """Seeds at which the expert failed at one kind, with those of earlier runs."""
     seconds: float = 0.0
+    """Duration of this run."""
 
 
 def record(config: RecordConfig) -> RecordReport:
@@ -71,7 +62,7 @@ def record(config: RecordConfig) -> RecordReport:
 
     Raises:
         FileExistsError: If the folder holds something and `resume` is off.
-        ValueError: If an option does not fit the environment or the dataset to go on with.
+        ValueError: If an option does not fit the dataset to go on with.
         RuntimeError: If the expert keeps failing, or the upload fails; the dataset on disk stays whole.
     """
     start = time.perf_counter()
@@ -103,11 +94,7 @@ def record(config: RecordConfig) -> RecordReport:
 
 
 def _record_missing(
-    config: RecordConfig,
-    env: DoorEnv,
-    directory: StagedDirectory,
-    provenance: Provenance,
-    report: RecordReport,
+    config: RecordConfig, env: DoorEnv, directory: StagedDirectory, provenance: Provenance, report: RecordReport
 ) -> None:
     done = len(provenance.episodes)
     with tqdm(total=config.total_episodes, initial=done, desc="Recording", unit="episode") as progress:
@@ -116,19 +103,11 @@ def _record_missing(
             sources = [{"kind": demonstration.kind, "seed": demonstration.seed} for demonstration in group]
             with directory.change() as staged:
                 _write_episodes(config, env, staged, group)
-                after = replace(provenance, episodes=provenance.episodes + sources)
-                after.write(staged)
-            for demonstration in group:
-                report.episodes.append(
-                    {
-                        "episode_index": len(provenance.episodes),
-                        "kind": demonstration.kind,
-                        "seed": demonstration.seed,
-                        "branch_step": demonstration.branch_step,
-                        "success_step": demonstration.success_step,
-                    }
-                )
-                provenance.episodes.append({"kind": demonstration.kind, "seed": demonstration.seed})
+                replace(provenance, episodes=provenance.episodes + sources).write(staged)
+            for demonstration, source in zip(group, sources, strict=True):
+                steps = {"branch_step": demonstration.branch_step, "success_step": demonstration.success_step}
+                report.episodes.append({"episode_index": len(provenance.episodes)} | source | steps)
+                provenance.episodes.append(source)
             progress.update(len(group))
 
 
@@ -178,16 +157,15 @@ def _write_episodes(config: RecordConfig, env: DoorEnv, staged: Path, group: lis
     else:
         dataset = LeRobotDataset.create(
             config.repo_id,
-            fps=env.metadata["render_fps"],
+            fps=FPS,
             features=_features(config, env),
             robot_type=ROBOT_TYPES[config.arm],
             **options,
         )
     try:
         for demonstration in group:
-            for image, state, action in zip(
-                demonstration.images, demonstration.states, demonstration.actions, strict=True
-            ):
+            frames = zip(demonstration.images, demonstration.states, demonstration.actions, strict=True)
+            for image, state, action in frames:
                 dataset.add_frame({CAMERA: image, OBS_STATE: state, ACTION: action, "task": env.task_description})
             with SuppressProgressBars():
                 dataset.save_episode()
@@ -213,11 +191,8 @@ def _check_video(root: Path, num_frames: int) -> None:
 def _features(config: RecordConfig, env: DoorEnv) -> dict[str, dict[str, Any]]:
     joints = [f"{name}.pos" for name in env.joint_names]
     vector = {"dtype": "float32", "shape": (len(joints),), "names": joints}
-    image = {
-        "dtype": "video",
-        "shape": (env.observation_size, env.observation_size, 3),
-        "names": ["height", "width", "channels"],
-    }
+    size = env.observation_size
+    image = {"dtype": "video", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
     return {OBS_STATE: vector, ACTION: dict(vector), CAMERA: image}
 
 

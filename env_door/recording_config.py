@@ -5,11 +5,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from draccus.utils import ParsingError
 from huggingface_hub.utils import HFValidationError, validate_repo_id
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from env_door.checks import check_choice, check_range
 from env_door.latch import KINDS, check_kinds
+from env_door.limits import MAX_OFFSET
 
 ROBOT_TYPES = {"ur5e": "ur5e_robotiq", "panda": "panda"}
 # Options that may change between the runs that make up one dataset.
@@ -37,67 +40,49 @@ class FrameEncoderConfig(RGBEncoderConfig):
 class RecordConfig:
     """What to record, and where to.
 
-    Args:
-        repo_id (`str`):
-            Name of the dataset, `{hf_username}/{dataset_name}`.
-        root (`str | Path | None`, *optional*):
-            Folder of the dataset; defaults to `$HF_LEROBOT_HOME/{repo_id}`.
-        episodes_per_kind (`int`, *optional*, defaults to 5):
-            Episodes to save for each kind of door.
-        kinds (`list[str]`, *optional*, defaults to `["push", "pull", "slide"]`):
-            Kinds of door to record.
-        arm (`str`, *optional*, defaults to `"ur5e"`):
-            `"ur5e"` or `"panda"`.
-        door_offset (`float`, *optional*, defaults to 0.0):
-            Half-width, in metres, of the range of the door's lateral shift, 0 to 0.05: spread evenly over matched
-            demonstrations, drawn for others.
-        seed (`int`, *optional*, defaults to 0):
-            First seed; the following episodes count up from it.
-        matched (`bool`, *optional*, defaults to `True`):
-            Use the same seeds for every kind.
-        num_steps (`int`, *optional*, defaults to 150):
-            Frames of an episode, at 10 Hz.
-        rgb_encoder (`FrameEncoderConfig`, *optional*):
-            Video encoder; by default one that keeps the kind of the door out of earlier frames.
-        push_to_hub (`bool`, *optional*, defaults to `False`):
-            Upload the dataset once it is complete.
-        private (`bool | None`, *optional*):
-            Upload as a private dataset; `None` leaves it to the Hub's default.
-        tags (`list[str] | None`, *optional*):
-            Tags of the dataset on the Hub.
-        resume (`bool`, *optional*, defaults to `False`):
-            Go on with an interrupted recording, or extend a finished one.
-
     Raises:
-        ValueError: If a field is out of its range.
+        ParsingError: If a field is out of its range.
     """
 
     repo_id: str
+    """Name of the dataset, {hf_username}/{dataset_name}."""
     root: str | Path | None = None
+    """Folder of the dataset; by default $HF_LEROBOT_HOME/{repo_id}."""
     episodes_per_kind: int = 5
+    """Episodes to save for each kind of door."""
     kinds: list[str] = field(default_factory=lambda: list(KINDS))
+    """Kinds of door to record: push, pull, slide."""
     arm: str = "ur5e"
+    """ur5e or panda."""
     door_offset: float = 0.0
+    """Half-width in m, 0 to 0.05, of the range of the door's lateral shift: spread evenly if matched, else drawn."""
     seed: int = 0
+    """First seed; the following episodes count up from it."""
     matched: bool = True
+    """Use the same seeds for every kind."""
     num_steps: int = 150
+    """Frames of an episode, 10 a second."""
     rgb_encoder: FrameEncoderConfig = field(default_factory=FrameEncoderConfig)
+    """Video encoder; by default one that keeps the kind of the door out of earlier frames."""
     push_to_hub: bool = False
+    """Upload the dataset once it is complete."""
     private: bool | None = None
+    """Upload as a private dataset; None leaves it to the Hub's default."""
     tags: list[str] | None = None
+    """Tags of the dataset on the Hub."""
     resume: bool = False
+    """Go on with an interrupted recording, or extend a finished one."""
 
     def __post_init__(self) -> None:
         _check_repo_id(self.repo_id)
-        if self.episodes_per_kind < 1:
-            raise ValueError(f"episodes_per_kind must be at least 1, got {self.episodes_per_kind}.")
-        check_kinds(self.kinds, "kinds")
-        if self.arm not in ROBOT_TYPES:
-            raise ValueError(f"arm must be one of {', '.join(ROBOT_TYPES)}, got {self.arm!r}.")
-        if self.seed < 0:
-            raise ValueError(f"seed must be 0 or more, got {self.seed}.")
-        if self.num_steps < 1:
-            raise ValueError(f"num_steps must be at least 1, got {self.num_steps}.")
+        check_range(self, "episodes_per_kind", "num_steps", low=1)
+        check_range(self, "seed", low=0)
+        check_choice(self, "arm", ROBOT_TYPES)
+        check_range(self, "door_offset", low=0.0, high=MAX_OFFSET, unit="m")
+        try:
+            check_kinds(self.kinds, "kinds")
+        except ValueError as error:
+            raise ParsingError(str(error)) from None
 
     @property
     def path(self) -> Path:
@@ -120,8 +105,8 @@ def _check_repo_id(repo_id: str) -> None:
     try:
         validate_repo_id(repo_id)
     except HFValidationError as error:
-        raise ValueError(f"{wanted}: {error}") from error
+        raise ParsingError(f"{wanted}: {error}") from error
     if "/" not in repo_id:
-        raise ValueError(f"{wanted}; got {repo_id!r}.")
+        raise ParsingError(f"{wanted}; got {repo_id!r}.")
     if re.search("/eval_", repo_id):
-        raise ValueError(f"Dataset names starting with 'eval_' are reserved for evaluations, got {repo_id!r}.")
+        raise ParsingError(f"Dataset names starting with 'eval_' are reserved for evaluations, got {repo_id!r}.")

@@ -1,29 +1,31 @@
 """Pictures of the scene, with whatever this machine can draw.
 
-MuJoCo picks its OpenGL loader from the environment variable `MUJOCO_GL` while it is imported, and with
-nothing set and no display it picks GLFW, which ends the process. `choose_backend` therefore runs before the
-first `import mujoco` of this package and sets the variable where the user has not: EGL, then OSMesa, then
-none at all, in which case pictures are ray-cast on the CPU.
+How is chosen at the first picture: what `MUJOCO_GL` names, or else EGL, OSMesa, or nothing at all, in which case
+pictures are ray-cast on the CPU. MuJoCo's own `Renderer` draws with what was chosen while MuJoCo was imported: GLFW
+where no variable was set, which ends the process without a display. So only MuJoCo's OpenGL contexts are used here; no
+variable needs to be set for them, and it does not matter who imported MuJoCo first.
 """
 
+import contextlib
 import ctypes
 import ctypes.util
 import importlib
 import os
 import sys
 import warnings
-from typing import TYPE_CHECKING, Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    import mujoco
+from env_door.ray_casting import RayCastRenderer
+from env_door.simulator import mujoco
 
 _EGL_PLATFORM_DEVICE = 0x313F
-_MAX_GEOMS = 1000  # MuJoCo's default of 10000 makes a renderer slower to create; the scene has some 50
+_MAX_GEOMS = 1000  # MuJoCo's default of 10000 makes a scene slower to create; this one has some 50
 _SMOOTHING = 1.5  # a smooth picture is drawn this much larger
+_OFF = ("disable", "disabled", "off", "false", "0")
 _RAY_NOTICE = (
     "pictures are ray-cast on the CPU, in slightly other colours (do not mix both in one dataset); "
     "OpenGL needs EGL (Debian: libegl1, libgl1-mesa-dri) or OSMesa"
@@ -31,32 +33,33 @@ _RAY_NOTICE = (
 
 
 def choose_backend() -> str:
-    """Sets `MUJOCO_GL` where it is unset, without loading MuJoCo and without risk to the process.
-
-    Where MuJoCo has been imported already, it is made to look again.
+    """How to draw here, found out without risk to the process.
 
     Returns:
-        `str`: the value of `MUJOCO_GL` that holds: the user's own, `egl`, `osmesa`, or `disable` for
-        ray-casting.
+        `str`: `egl`, `osmesa`, `glfw`, `mujoco` (its own choice, safe on macOS and Windows), or `disable`: ray-casting.
 
     Raises:
         RuntimeError: If the user's own choice is EGL or OSMesa and that library does not work here.
     """
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if chosen in _OFF:
+        return "disable"
     if not sys.platform.startswith("linux"):
-        return chosen
+        return "mujoco"
     works = {"egl": _egl_works, "osmesa": _osmesa_works}
     if chosen in works and not works[chosen]():
         raise RuntimeError(
             f"MUJOCO_GL={chosen} is set, but that library does not work on this machine; unset MUJOCO_GL to let "
             "env_door choose, or set MUJOCO_GL=disable for pictures without OpenGL"
         )
-    if not chosen:
-        chosen = next((loader for loader, probe in works.items() if probe()), "disable")
-        os.environ["MUJOCO_GL"] = chosen
-        if "mujoco.rendering.classic.gl_context" in sys.modules:
-            importlib.reload(sys.modules["mujoco.rendering.classic.gl_context"])
-    return chosen
+    if chosen in works:
+        return chosen
+    if chosen in ("glfw", "glx"):
+        # Even trying GLFW without a display would end the process.
+        return "glfw" if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") else "disable"
+    # PyOpenGL serves one of them in a process: whoever was here before may have settled which.
+    settled = os.environ.get("PYOPENGL_PLATFORM", "").strip().lower()
+    return next((name for name in works if settled in ("", name) and works[name]()), "disable")
 
 
 def _osmesa_works() -> bool:
@@ -91,7 +94,7 @@ def _egl_works() -> bool:
 class Renderer(Protocol):
     """Draws the scene from one of its cameras."""
 
-    def draw(self, data: "mujoco.MjData") -> NDArray[np.uint8]:
+    def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
         """Picture of the current state, shape `(size, size, 3)`."""
 
     def close(self) -> None:
@@ -99,60 +102,67 @@ class Renderer(Protocol):
 
 
 class OpenGLRenderer:
-    """Draws with OpenGL.
+    """Draws with OpenGL; takes what `make_renderer` takes, and what `choose_backend` returns."""
 
-    Args:
-        model (`mujoco.MjModel`):
-            The scene.
-        camera (`str`):
-            Name of the camera.
-        size (`int`):
-            Height and width of the picture in pixels.
-        smooth (`bool`, *optional*, defaults to `False`):
-            Whether to smooth edges, for people rather than for a policy.
-    """
-
-    def __init__(self, model: "mujoco.MjModel", camera: str, size: int, smooth: bool = False):
-        import mujoco
-
+    def __init__(self, model: mujoco.MjModel, camera: str, size: int, smooth: bool = False, backend: str | None = None):
+        self._context: Any = None
+        self._drawing: mujoco.MjrContext | None = None
+        self._model = model
         self._size = size
         # On a CPU, drawing larger and shrinking costs a third of what OpenGL's own multisampling does.
         drawn = round(size * _SMOOTHING) if smooth else size
+        self._rectangle = mujoco.MjrRect(0, 0, drawn, drawn)
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = model.camera(camera).id
+        self._option = mujoco.MjvOption()
+        self._scene = mujoco.MjvScene(model=model, maxgeom=_MAX_GEOMS)
+        # Shadows alone would multiply the cost of a picture by four on a CPU.
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = 0
+        backend = backend or choose_backend()
+        package = mujoco if backend == "mujoco" else importlib.import_module(f"mujoco.{backend}")
+        self._context = package.GLContext(drawn, drawn)
+        self._context.make_current()
         # The context takes the size of its buffer from the model at creation.
         settings = model.vis.global_
         buffer = settings.offwidth, settings.offheight
         settings.offwidth = settings.offheight = drawn
         try:
-            self._renderer = mujoco.Renderer(model, drawn, drawn, max_geom=_MAX_GEOMS)
+            self._drawing = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
         finally:
             settings.offwidth, settings.offheight = buffer
-        self._camera = camera
-        # Shadows alone would multiply the cost of a picture by four on a CPU.
-        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
-            self._renderer.scene.flags[flag] = 0
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawing)
 
-    def draw(self, data: "mujoco.MjData") -> NDArray[np.uint8]:
-        """Picture of the current state.
-
-        Args:
-            data (`mujoco.MjData`):
-                State of the scene.
-
-        Returns:
-            `NDArray[np.uint8]`: picture, shape `(size, size, 3)`.
-        """
-        self._renderer.update_scene(data, self._camera)
-        picture = self._renderer.render()
+    def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
+        """Picture of the current state, shape `(size, size, 3)`."""
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, everything, self._scene)
+        self._context.make_current()
+        picture = np.empty((self._rectangle.height, self._rectangle.width, 3), dtype=np.uint8)
+        mujoco.mjr_render(self._rectangle, self._scene, self._drawing)
+        mujoco.mjr_readPixels(picture, None, self._rectangle, self._drawing)
+        picture = np.ascontiguousarray(picture[::-1])  # OpenGL's first row is the lowest one
         if len(picture) == self._size:
             return picture
         return cv2.resize(picture, (self._size, self._size), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
     def close(self) -> None:
         """Frees the OpenGL context."""
-        self._renderer.close()
+        if self._drawing is not None:
+            self._context.make_current()
+            self._drawing.free()
+        if self._context is not None:
+            self._context.free()
+        self._drawing = self._context = None
+
+    def __del__(self) -> None:
+        # Without its context at hand, freeing what was drawn with would crash; at exit the display may be gone already.
+        with contextlib.suppress(Exception):
+            self.close()
 
 
-def make_renderer(model: "mujoco.MjModel", camera: str, size: int, smooth: bool = False) -> Renderer:
+def make_renderer(model: mujoco.MjModel, camera: str, size: int, smooth: bool = False) -> Renderer:
     """The best renderer that works here.
 
     Args:
@@ -166,35 +176,21 @@ def make_renderer(model: "mujoco.MjModel", camera: str, size: int, smooth: bool 
             Whether to smooth edges where OpenGL draws.
 
     Returns:
-        `Renderer`: an `OpenGLRenderer`, or a `RayCastRenderer` together with a warning where OpenGL does not
-        work.
-    """
-    from env_door.ray_casting import RayCastRenderer
+        `Renderer`: an `OpenGLRenderer`, or a `RayCastRenderer` and a warning where OpenGL does not work.
 
-    loader = _loader_of_mujoco()
-    if loader == "glfw" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        # Even trying GLFW without a display would end the process.
-        loader = "none"
-    if loader == "none":
+    Raises:
+        RuntimeError: If the user set `MUJOCO_GL` to a library that does not work here.
+    """
+    backend = choose_backend()
+    if backend == "disable":
         _notice("no OpenGL for off-screen drawing is set up")
         return RayCastRenderer(model, camera, size)
     try:
-        return OpenGLRenderer(model, camera, size, smooth)
+        return OpenGLRenderer(model, camera, size, smooth, backend)
     except Exception as error:
-        # Drivers fail in many ways (ImportError, AttributeError, GLError, RuntimeError): all mean "no
-        # picture".
-        _notice(f"OpenGL through {loader} failed ({error})")
+        # Drivers fail in many ways (ImportError, AttributeError, GLError, RuntimeError): all mean "no picture".
+        _notice(f"OpenGL through {backend} failed ({error})")
         return RayCastRenderer(model, camera, size)
-
-
-def _loader_of_mujoco() -> str:
-    """Which loader MuJoCo was imported with: `egl`, `osmesa`, `glfw`, `cgl`, `wgl` or `none`."""
-    import mujoco.rendering.classic.gl_context as gl_context
-
-    context = getattr(gl_context, "GLContext", None)
-    if context is None or context.__name__ == "_MissingGLContext":
-        return "none"
-    return str(context.__module__).split(".")[1]
 
 
 def _notice(reason: str) -> None:

@@ -95,17 +95,7 @@ class StagedDirectory:
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Swap two paths of one file system atomically, where the platform can.
-
-    Args:
-        first (`Path`):
-            A file or directory.
-        second (`Path`):
-            Another one.
-
-    Returns:
-        `bool`: Whether they were swapped; `False` leaves both as they were.
-    """
+    """Swap two paths of one file system atomically, where the platform can; `False` leaves both as they were."""
     paths = os.fsencode(first), os.fsencode(second)
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "renameat2"):
         at_cwd, rename_exchange = -100, 2

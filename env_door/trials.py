@@ -19,38 +19,26 @@ from env_door.latch import KINDS
 
 @dataclass(frozen=True)
 class Trial:
-    """What happened in one trial.
-
-    Args:
-        seed (`int | None`):
-            Seed that the environment was reset with; `None` when it was reset without one.
-        door_kind (`str`):
-            Kind of the door: `"push"`, `"pull"` or `"slide"`.
-        success (`bool`):
-            Whether the door was opened.
-        steps (`int`):
-            Control steps taken, 10 a second.
-        attempts (`tuple[str, ...]`):
-            Directions in which the unlatched door was tried, in order.
-        opening (`float`):
-            How far the door stood open at the end, 0 closed, 1 the success threshold.
-        door_offset (`float`):
-            Lateral shift of the door in metres.
-        held_at (`int | None`, *optional*):
-            First control step, counted from 0, during which somebody held the door; `None` if nobody did.
-        tried_while_held (`tuple[str, ...]`, *optional*, defaults to `()`):
-            Directions other than the door's own in which the opened door was tried while it was held, in order.
-    """
+    """What happened in one trial."""
 
     seed: int | None
+    """Seed that the environment was reset with; `None` when it was reset without one."""
     door_kind: str
+    """Kind of the door: `"push"`, `"pull"` or `"slide"`."""
     success: bool
+    """Whether the door was opened."""
     steps: int
+    """Control steps taken, 10 a second."""
     attempts: tuple[str, ...]
+    """Directions in which the unlatched door was tried, in order."""
     opening: float
+    """How far the door stood open at the end, 0 closed, 1 the success threshold."""
     door_offset: float
+    """Lateral shift of the door in metres."""
     held_at: int | None = None
+    """First control step, counted from 0, during which somebody held the door; `None` if nobody did."""
     tried_while_held: tuple[str, ...] = ()
+    """Directions other than the door's own in which the opened door was tried while it was held, in order."""
 
     @property
     def first_try_wrong(self) -> bool:
@@ -131,14 +119,7 @@ class TrialLog(gym.Wrapper):
 
 
 def append_trial(path: str | Path, trial: Trial) -> None:
-    """Add a trial to a log, in a single write.
-
-    Args:
-        path (`str | Path`):
-            File to append to.
-        trial (`Trial`):
-            The trial.
-    """
+    """Add a trial to a log, in a single write."""
     line = json.dumps(asdict(trial)) + "\n"
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     try:
@@ -185,19 +166,6 @@ def read_trials(path: str | Path) -> list[Trial]:
 
 
 def first_of_each_kind(trials: list[Trial], count: int) -> list[Trial]:
-    """Keep the trials that `lerobot-eval` counts: it fills its last batch with a few more.
-
-    Args:
-        trials (`list[Trial]`):
-            Trials of one evaluation, in any order.
-        count (`int`):
-            How many to keep of each kind.
-
-    Returns:
-        `list[Trial]`: Those with the lowest seeds, kind by kind.
-    """
-    kept = []
-    for kind in KINDS:
-        of_kind = sorted((trial for trial in trials if trial.door_kind == kind), key=lambda trial: trial.seed or 0)
-        kept += of_kind[:count]
-    return kept
+    """Of each kind the trials that `lerobot-eval` counts, those with the lowest seeds: its last batch may hold more."""
+    ordered = sorted(trials, key=lambda trial: trial.seed or 0)
+    return [trial for kind in KINDS for trial in [t for t in ordered if t.door_kind == kind][:count]]

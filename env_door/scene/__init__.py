@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import mujoco
+if TYPE_CHECKING:
+    import mujoco
 
 GRIPPER_STROKE = 0.085
 """Opening of the gripper between its pads, in metres (Robotiq 2F-85)."""
@@ -11,24 +13,17 @@ GRIPPER_STROKE = 0.085
 
 @dataclass(frozen=True)
 class Arm:
-    """What differs between the arms beyond their XML.
-
-    Args:
-        name (`str`):
-            The value that `DoorEnv(arm=...)` takes; also the name of the XML file.
-        joints (`tuple[str, ...]`):
-            Names of the arm's joints from base to wrist.
-        joint_speed (`tuple[float, ...]`):
-            Largest joint speeds that the maker states, in rad/s.
-        ready_pose (`tuple[float, ...]`):
-            Joint angles in rad with the open gripper in front of the knob; inverse kinematics starts here,
-            which keeps every plan on the same branch (elbow up).
-    """
+    """What differs between the arms beyond their XML."""
 
     name: str
+    """The value that `DoorEnv(arm=...)` takes; also the name of the XML file."""
     joints: tuple[str, ...]
+    """Names of the arm's joints from base to wrist."""
     joint_speed: tuple[float, ...]
+    """Largest joint speeds that the maker states, in rad/s."""
     ready_pose: tuple[float, ...]
+    """Joint angles in rad with the open gripper in front of the knob; inverse kinematics starts here, which keeps every
+    plan on the same branch (elbow up)."""
 
 
 UR5E = Arm(
@@ -46,19 +41,14 @@ PANDA = Arm(
 ARMS = {arm.name: arm for arm in (UR5E, PANDA)}
 
 
-def load_model(arm: str) -> mujoco.MjModel:
-    """Compiles the scene with one of the arms.
-
-    Args:
-        arm (`str`):
-            A key of `ARMS`.
-
-    Returns:
-        `mujoco.MjModel`: the compiled scene.
+def load_model(arm: str) -> "mujoco.MjModel":
+    """Compiles the scene with one of the `ARMS`.
 
     Raises:
         ValueError: If there is no such arm.
     """
+    from env_door.simulator import mujoco  # here, so that configurations can look up the arms without it
+
     if arm not in ARMS:
         raise ValueError(f"arm={arm!r} is unknown; choose one of {sorted(ARMS)}")
     return mujoco.MjModel.from_xml_path(str(Path(__file__).parent / f"{arm}.xml"))

@@ -17,24 +17,29 @@ def env():
     env.close()
 
 
-def open_door(env, directions, seed, offset=None, num_steps=140):
-    """Step of the first success, and the expert."""
-    options = {"kind": directions[-1]} | ({} if offset is None else {"door_offset": offset})
-    env.reset(seed=seed, options=options)
+def planned(env, directions, seed):
     expert = DoorExpert(env, directions)
     expert.reset(np.random.default_rng(seed))
+    return expert
+
+
+def open_door(env, directions, seed, offset=None, num_steps=140):
+    """Step of the first success, if there is one."""
+    options = {"kind": directions[-1]} | ({} if offset is None else {"door_offset": offset})
+    env.reset(seed=seed, options=options)
+    expert = planned(env, directions, seed)
     for step in range(num_steps):
         env.advance(expert.act())
         if env.latch.is_open:
-            return step, expert
-    return None, expert
+            return step
+    return None
 
 
 @pytest.mark.parametrize("offset", [-0.05, 0.0, 0.05])
 @pytest.mark.parametrize("kind", KINDS)
 def test_opens_every_kind_at_every_offset(env, kind, offset):
     for seed in range(2):
-        step, _ = open_door(env, (kind,), seed, offset)
+        step = open_door(env, (kind,), seed, offset)
         assert step is not None
         assert 81 <= step <= 110
         assert env.latch.attempts == (kind,)
@@ -60,14 +65,14 @@ def test_hinged_doors_open_within_a_hundred_steps_at_the_slowest_timing(env, kin
 @pytest.mark.parametrize("kind", KINDS)
 def test_panda_opens_every_kind(kind):
     env = DoorEnv(arm="panda", door_offset=0.05)
-    step, _ = open_door(env, (kind,), 0)
+    step = open_door(env, (kind,), 0)
     assert step is not None
     assert env.latch.attempts == (kind,)
 
 
 @pytest.mark.parametrize("order", WRONG_THEN_RIGHT, ids=" then ".join)
 def test_opens_after_wrong_tries(env, order):
-    step, _ = open_door(env, order, 3, num_steps=200)
+    step = open_door(env, order, 3, num_steps=200)
     assert step is not None
     assert env.latch.attempts == order
 
@@ -76,8 +81,7 @@ def test_opens_after_wrong_tries(env, order):
 def test_grip_survives_thirty_steps_against_a_shut_door(env, right):
     """As a learned policy might, push as hard as the controller allows; then go back and open the door properly."""
     env.reset(seed=0, options={"kind": right})
-    expert = DoorExpert(env, ("push",))
-    expert.reset(np.random.default_rng(0))
+    expert = planned(env, ("push",), 0)
     actions = [expert.act() for _ in range(expert.branch_step + 30)]
     for action in actions:
         env.advance(action)
@@ -94,37 +98,28 @@ def test_grip_survives_thirty_steps_against_a_shut_door(env, right):
     assert env.latch.is_open
 
 
-def test_plan_before_the_branch_does_not_depend_on_directions(env):
+def test_plans_part_at_the_branch_and_not_before(env):
     plans, branches = [], []
     for directions in [(kind,) for kind in KINDS] + WRONG_THEN_RIGHT:
         env.reset(seed=4, options={"kind": directions[-1]})
-        expert = DoorExpert(env, directions)
-        expert.reset(np.random.default_rng(4))
+        expert = planned(env, directions, 4)
         branches.append(expert.branch_step)
-        plans.append(np.array([expert.act() for _ in range(expert.branch_step)]))
-    assert len(set(branches)) == 1
-    for plan in plans[1:]:
-        np.testing.assert_array_equal(plan, plans[0])
-
-
-def test_branch_step_is_the_first_opening_action(env):
-    env.reset(seed=0)
-    experts = [DoorExpert(env, (kind,)) for kind in KINDS]
-    for expert in experts:
-        expert.reset(np.random.default_rng(0))
+        plans.append([])
         for _ in range(expert.branch_step):
             assert expert.phase in ("approach", "advance", "grasp", "twist")
-            expert.act()
-        assert expert.phase == "open"
-    first, second, third = (expert.act() for expert in experts)
-    assert np.abs(first - second).max() > 1e-4
-    assert np.abs(first - third).max() > 1e-4
+            plans[-1].append(expert.act())
+        assert expert.phase == ("open" if len(directions) == 1 else f"try_{directions[0]}")
+        plans[-1].append(expert.act())
+    assert len(set(branches)) == 1
+    for plan in plans[1:]:
+        np.testing.assert_array_equal(plan[:-1], plans[0][:-1])
+    for plan in plans[1:3]:
+        assert np.abs(plan[-1] - plans[0][-1]).max() > 1e-4
 
 
 def test_phases_come_in_order(env):
     env.reset(seed=0, options={"kind": "push"})
-    expert = DoorExpert(env, ("slide", "pull", "push"))
-    expert.reset(np.random.default_rng(0))
+    expert = planned(env, ("slide", "pull", "push"), 0)
     phases = []
     for _ in range(200):
         phases.append(expert.phase)
@@ -139,45 +134,32 @@ def test_timing_varies_with_the_rng_only(env):
     lengths = set()
     for seed in range(8):
         env.reset(seed=0)
-        expert = DoorExpert(env, ("push",))
-        expert.reset(np.random.default_rng(seed))
+        expert = planned(env, ("push",), seed)
         lengths.add(expert.branch_step)
     assert len(lengths) > 2
     assert min(lengths) >= 55
     assert max(lengths) <= 64
 
 
-def test_commands_stay_within_what_the_controller_follows(env):
+def test_commands_stay_within_what_the_controller_follows_and_near_what_is_measured(env):
     """Recorded actions are the executed ones only if the controller never had to limit them."""
     for kind in KINDS:
         env.reset(seed=1, options={"kind": kind})
-        expert = DoorExpert(env, (kind,))
-        expert.reset(np.random.default_rng(1))
+        expert, gaps = planned(env, (kind,), 1), []
         for _ in range(130):
+            holding = expert.phase in ("twist", "open", "hold")
             action = expert.act()
             np.testing.assert_allclose(env.limit_action(action), action, atol=1e-6)
             env.advance(action)
-
-
-def test_gripper_command_stays_near_its_measurement(env):
-    env.reset(seed=1, options={"kind": "pull"})
-    expert = DoorExpert(env, ("pull",))
-    expert.reset(np.random.default_rng(1))
-    gaps = []
-    for _ in range(120):
-        holding = expert.phase in ("twist", "open", "hold")
-        action = expert.act()
-        env.advance(action)
-        if holding:
-            gaps.append(action[-1] - env.measured_joints()[-1])
-    assert min(gaps) > 0.02, "the pads must press"
-    assert max(gaps) < 0.12
+            if holding:
+                gaps.append(action[-1] - env.measured_joints()[-1])
+        assert min(gaps) > 0.02, "the pads must press"
+        assert max(gaps) < 0.12
 
 
 def test_blocked_try_shows_in_the_joints(env):
     env.reset(seed=2, options={"kind": "slide"})
-    expert = DoorExpert(env, ("push", "slide"))
-    expert.reset(np.random.default_rng(2))
+    expert = planned(env, ("push", "slide"), 2)
     free, blocked = [], []
     for step in range(expert.branch_step + 9):
         wrong = expert.phase == "try_push"
@@ -192,12 +174,9 @@ def test_blocked_try_shows_in_the_joints(env):
 
 
 @pytest.mark.parametrize("directions", [(), ("up",), ("push", "up")])
-def test_bad_directions_are_refused(env, directions):
+def test_bad_directions_and_acting_before_a_plan_are_refused(env, directions):
     with pytest.raises(ValueError, match="directions"):
         DoorExpert(env, directions)
-
-
-def test_act_before_reset_is_refused(env):
     with pytest.raises(RuntimeError, match="reset"):
         DoorExpert(env, ("push",)).act()
 

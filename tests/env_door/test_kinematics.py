@@ -97,6 +97,18 @@ def test_joint_limits_make_a_pose_unreachable():
         InverseKinematics(model, UR5E.joints).solve(np.array([0.6, 0, 0.95]), GRASP_ROTATION, np.array(UR5E.ready_pose))
 
 
+@pytest.mark.parametrize("arm", ARMS.values(), ids=lambda arm: arm.name)
+def test_jacobian_is_the_slope_of_the_forward_kinematics(arm):
+    solver, joints = SOLVERS[arm.name], np.array(arm.ready_pose)
+    jacobian = solver.jacobian(joints)
+    assert jacobian.shape == (6, len(joints))
+    for index, column in enumerate(jacobian.T):
+        step = 1e-5 * np.eye(len(joints))[index]
+        (ahead, turned), (behind, _) = solver.forward(joints + step), solver.forward(joints - step)
+        turn = Rotation.from_matrix(turned @ solver.forward(joints - step)[1].T).as_rotvec()
+        np.testing.assert_allclose(column, np.append(ahead - behind, turn) / 2e-5, atol=1e-6)
+
+
 def test_solver_does_not_disturb_the_simulation():
     model = load_model("ur5e")
     data = mujoco.MjData(model)

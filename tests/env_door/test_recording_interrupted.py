@@ -17,6 +17,7 @@ from pathlib import Path
 import draccus
 import numpy as np
 import pytest
+from draccus.utils import ParsingError
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
@@ -173,17 +174,13 @@ def test_lost_frames_are_noticed(tmp_path, expert, monkeypatch):
 
 def test_resuming_a_finished_recording_extends_it_or_does_nothing(tmp_path, expert):
     extended, at_once = tmp_path / "extended", tmp_path / "at_once"
-    record(configure(extended, episodes_per_kind=1))
+    record(configure(extended, episodes_per_kind=1, resume=True))  # nothing to resume: starts
     before = files(extended)
     assert record(configure(extended, episodes_per_kind=1, resume=True)).episodes == []
     assert files(extended) == before
     record(configure(extended, episodes_per_kind=2, resume=True))
     record(configure(at_once, episodes_per_kind=2))
     assert files(extended) == files(at_once)
-
-
-def test_resuming_nothing_starts_a_recording(tmp_path, expert):
-    assert record(configure(tmp_path / "door", episodes_per_kind=1, resume=True)).total_episodes == 3
 
 
 def test_a_seed_that_fails_for_one_kind_is_dropped_for_all(tmp_path, expert):
@@ -233,12 +230,6 @@ def test_resuming_a_folder_that_is_no_recording_is_refused(tmp_path, expert):
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_unwritable_root_is_named(tmp_path, expert):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="choose a writable root"):
-        record(configure(tmp_path / "file" / "door"))
-
-
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
@@ -246,18 +237,18 @@ def test_unwritable_root_is_named(tmp_path, expert):
         ("repo_id", "a/b/c", "hf_username"),
         ("repo_id", "me/my door", "hf_username"),
         ("repo_id", "me/eval_door", "reserved"),
-        ("episodes_per_kind", 0, "at least 1"),
+        ("episodes_per_kind", 0, "`episodes_per_kind` must be at least 1, got 0"),
         ("kinds", ["push", "lift"], KINDS_ALLOWED),
         ("kinds", [], KINDS_ALLOWED),
         ("kinds", ["push", "push"], KINDS_ALLOWED),
-        ("arm", "ur10", "ur5e, panda"),
-        ("seed", -1, "0 or more"),
-        ("num_steps", 0, "at least 1"),
-        ("door_offset", 0.2, "door_offset"),
+        ("arm", "ur10", r"`arm` must be one of \['ur5e', 'panda'\], got 'ur10'"),
+        ("seed", -1, "`seed` must be at least 0, got -1"),
+        ("num_steps", 0, "`num_steps` must be at least 1, got 0"),
+        ("door_offset", 0.2, "`door_offset` must be at least 0 and at most 0.05 m, got 0.2"),
     ],
 )
 def test_bad_options_are_refused_before_anything_is_written(tmp_path, option, value, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ParsingError, match=message):
         record(configure(tmp_path / "door", **{option: value}))
     assert os.listdir(tmp_path) == []
 

@@ -1,3 +1,4 @@
+import importlib
 import os
 import subprocess
 import sys
@@ -66,32 +67,36 @@ def test_import_of_mujoco_first_draws_the_same_as_import_of_env_door_first():
     assert first.stdout == run_fresh(DRAW).stdout
 
 
-def test_mujocos_own_renderer_works_after_import_of_env_door():
-    code = "import env_door, mujoco\nm = mujoco.MjModel.from_xml_string('<mujoco/>')\nmujoco.Renderer(m, 8, 8).close()"
-    if choose_backend() == "disable":
-        pytest.skip("no OpenGL on this machine")
-    assert run_fresh(code).returncode == 0
-
-
 @pytest.mark.parametrize("loader", ["egl", "osmesa"])
 def test_broken_choice_of_the_user_is_told(monkeypatch, loader):
     monkeypatch.setenv("MUJOCO_GL", loader)
     monkeypatch.setattr(rendering, f"_{loader}_works", lambda: False)
-    with pytest.raises(RuntimeError, match=f"MUJOCO_GL={loader}"):
-        choose_backend()
+    with pytest.raises(RuntimeError, match=f"MUJOCO_GL={loader} is set, but .* unset MUJOCO_GL .* MUJOCO_GL=disable"):
+        rendering.make_renderer(None, "front", 32)
+
+
+def test_a_choice_with_which_mujoco_cannot_be_imported_is_told():
+    result = run_fresh("import env_door, env_door.env", MUJOCO_GL="telepathy")
+    assert "MUJOCO_GL=telepathy is set; unset it to let env_door choose" in result.stderr
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux has a choice")
 @pytest.mark.parametrize(
-    ("egl", "osmesa", "expected"), [(True, True, "egl"), (False, True, "osmesa"), (False, False, "disable")]
+    ("egl", "osmesa", "settled", "expected"),
+    [
+        (True, True, "", "egl"),
+        (False, True, "", "osmesa"),
+        (False, False, "", "disable"),
+        (True, True, "osmesa", "osmesa"),  # PyOpenGL was imported by something else
+        (True, True, "glx", "disable"),
+    ],
 )
-def test_order_of_preference(monkeypatch, egl, osmesa, expected):
+def test_order_of_preference_when_nothing_is_set(monkeypatch, egl, osmesa, settled, expected):
     monkeypatch.setattr(rendering, "_egl_works", lambda: egl)
     monkeypatch.setattr(rendering, "_osmesa_works", lambda: osmesa)
-    monkeypatch.setattr(rendering.importlib, "reload", lambda module: module)
     monkeypatch.setenv("MUJOCO_GL", "")
+    monkeypatch.setenv("PYOPENGL_PLATFORM", settled)
     assert choose_backend() == expected
-    assert os.environ["MUJOCO_GL"] == expected
 
 
 def test_failing_driver_falls_back(env, monkeypatch):
@@ -99,7 +104,7 @@ def test_failing_driver_falls_back(env, monkeypatch):
         raise AttributeError("'NoneType' object has no attribute 'glGetError'")
 
     monkeypatch.setattr(rendering, "OpenGLRenderer", fail)
-    monkeypatch.setattr(rendering, "_loader_of_mujoco", lambda: "egl")
+    monkeypatch.setattr(rendering, "choose_backend", lambda: "egl")
     with pytest.warns(RuntimeWarning, match="glGetError"):
         renderer = rendering.make_renderer(env.model, "front", 32)
     assert isinstance(renderer, RayCastRenderer)
@@ -139,8 +144,10 @@ def test_renderers_leave_the_model_unchanged(env, opengl):
     assert (env.model.vis.global_.offwidth, env.model.vis.global_.offheight) == before
 
 
-def test_size_of_the_buffer_does_not_change_a_picture(env, opengl):
-    """Data recorded with a buffer of another size must stay comparable, bit by bit."""
+def test_pictures_are_those_of_mujocos_own_renderer(env, opengl, monkeypatch):
+    """Bit by bit, whatever the size of its buffer: data recorded with that renderer must stay comparable."""
+    context = importlib.import_module(f"mujoco.{choose_backend()}").GLContext
+    monkeypatch.setattr("mujoco.rendering.classic.gl_context.GLContext", context)
     reference = mujoco.Renderer(env.model, 128, 128)
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         reference.scene.flags[flag] = 0

@@ -1,6 +1,7 @@
-"""Measures the environment: `python -m env_door.check --seeds 100` prints what its documentation claims.
+"""Does the door keep its promises? `python experiments/door_check.py --seeds 100` prints what the documentation claims.
 
-Needs no learning code and no data. With 100 seeds it takes about five minutes on one core.
+Opening by the scripted expert at every offset and order of tries, distance of command and measurement, equality of the
+kinds before a try, speed. Needs no learning code and no data. With 100 seeds it takes about five minutes on one core.
 """
 
 import argparse
@@ -15,9 +16,10 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 from tqdm import tqdm
 
-from env_door.env import MAX_OFFSET, DoorEnv
+from env_door.env import DoorEnv
 from env_door.expert import DoorExpert
 from env_door.latch import KINDS
+from env_door.limits import MAX_OFFSET
 from env_door.ray_casting import RayCastRenderer
 from env_door.rendering import make_renderer
 from env_door.scene import ARMS
@@ -25,42 +27,20 @@ from env_door.scene import ARMS
 
 @dataclass(frozen=True)
 class Run:
-    """What one expert episode showed.
-
-    Args:
-        success_step (`int` or `None`):
-            Control step at which the door was open; `None` if it never was or if other directions than those asked
-            for were tried.
-        free_lag (`float`):
-            Largest distance in rad between commanded and measured joints before the first try.
-        blocked_lag (`float`):
-            The same while a wrong direction was tried; 0 without wrong tries.
-        grip_gap (`float`):
-            Largest distance between commanded and measured gripper once it holds the knob, in units of the stroke.
-    """
+    """What one expert episode showed."""
 
     success_step: int | None
+    """Step at which the door was open; `None` if it never was, or if other directions than asked for were tried."""
     free_lag: float
+    """Largest distance in rad between commanded and measured joints before the first try."""
     blocked_lag: float
+    """The same while a wrong direction was tried; 0 without wrong tries."""
     grip_gap: float
+    """Largest distance between commanded and measured gripper once it holds the knob, in units of the stroke."""
 
 
 def run_expert(env: DoorEnv, directions: tuple[str, ...], seed: int, offset: float | None = None) -> Run:
-    """Lets the expert try some directions on a door that opens in the last of them.
-
-    Args:
-        env (`DoorEnv`):
-            The environment.
-        directions (`tuple[str, ...]`):
-            Directions to try.
-        seed (`int`):
-            Seed of the environment and of the expert's timing.
-        offset (`float`, *optional*):
-            Sideways shift of the door in m; drawn by the environment when not given.
-
-    Returns:
-        `Run`: what was measured.
-    """
+    """Lets the expert try some directions on a door that opens in the last of them."""
     options = {"kind": directions[-1]} | ({} if offset is None else {"door_offset": offset})
     env.reset(seed=seed, options=options)
     expert = DoorExpert(env, directions)
@@ -105,18 +85,8 @@ def expert_table(
 
 
 def largest_difference_before_try(env: DoorEnv, seed: int) -> tuple[float, int, int]:
-    """Compares all kinds of door at one seed up to the branch, where the same actions have been taken.
-
-    Args:
-        env (`DoorEnv`):
-            The environment.
-        seed (`int`):
-            Seed of start pose, offset and timing.
-
-    Returns:
-        `tuple[float, int, int]`: largest difference of any element of the simulator's position (rad or m), of any
-        pixel, and the number of control steps compared.
-    """
+    """Compares all kinds of door at one seed up to the branch, where the same actions have been taken: the largest
+    difference of any element of the simulator's position (rad or m), of any pixel, and the number of steps compared."""
     traces = []
     for kind in KINDS:
         observation, _ = env.reset(seed=seed, options={"kind": kind})
@@ -165,7 +135,7 @@ def speed_table(env: DoorEnv) -> None:
 
 def main() -> None:
     """Runs every measurement."""
-    parser = argparse.ArgumentParser(prog="python -m env_door.check", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100, help="episodes for each kind and offset (default 100)")
     parser.add_argument("--arm", choices=sorted(ARMS), default="ur5e", help="which arm (default ur5e)")
     parser.add_argument(
