@@ -209,7 +209,7 @@ def test_watchdog_stops_the_arm_when_the_client_falls_silent(twin, control, rece
 # Faults of the link are tested with a client that only listens. One that commands connects again by itself and crashes
 # now and then: only a process of its own may hold it when a link breaks, as that of the robot's servo does.
 def test_dropped_link_leaves_stale_values_and_can_be_made_again(twin, receive):
-    twin.fault("drop_link")
+    twin.inject("drop_link")
     wait_until(lambda: not receive.isConnected())
     stale = receive.getTimestamp()
     time.sleep(0.05)
@@ -223,7 +223,7 @@ def test_dropped_link_leaves_stale_values_and_can_be_made_again(twin, receive):
 
 
 def test_frozen_link_stays_connected_while_nothing_comes(twin, receive):
-    twin.fault("freeze")
+    twin.inject("freeze")
     time.sleep(0.05)
     stale = receive.getTimestamp()
     time.sleep(0.1)
@@ -234,7 +234,7 @@ def test_frozen_link_stays_connected_while_nothing_comes(twin, receive):
 
 
 def test_frozen_for_long_the_client_gives_up(twin, receive):
-    twin.fault("freeze")
+    twin.inject("freeze")
     wait_until(lambda: not receive.isConnected())
 
 
@@ -243,7 +243,7 @@ def test_delayed_measurements(twin, receive):
         return twin.request("state")["controller_time"] - receive.getTimestamp()
 
     assert lateness() < 0.15
-    twin.fault("delay", ms=400.0)
+    twin.inject("delay", ms=400.0)
     wait_until(lambda: lateness() > 0.35)
     assert receive.isConnected()
     twin.clear("delay")
@@ -252,7 +252,7 @@ def test_delayed_measurements(twin, receive):
 
 def test_protective_stop(twin, control, receive):
     assert control.servoJ(receive.getActualQ(), *SERVO)
-    twin.fault("protective_stop")
+    twin.inject("protective_stop")
     wait_until(receive.isProtectiveStopped)
     wait_until(lambda: not control.isProgramRunning())
     assert not control.servoJ(receive.getActualQ(), *SERVO)
@@ -279,7 +279,7 @@ def test_protective_stop_stops_the_moving_arm(twin, control, receive):
 
 
 def test_emergency_stop_takes_the_power_away(twin, control, receive):
-    twin.fault("emergency_stop")
+    twin.inject("emergency_stop")
     wait_until(lambda: receive.isEmergencyStopped() and not control.isProgramRunning())
     assert receive.getRobotMode() == 3
     assert not control.servoJ(receive.getActualQ(), *SERVO)
@@ -291,27 +291,27 @@ def test_emergency_stop_takes_the_power_away(twin, control, receive):
 
 
 def test_power_off(twin, control, receive):
-    twin.fault("power_off")
+    twin.inject("power_off")
     wait_until(lambda: receive.getRobotMode() == 3 and not control.isProgramRunning())  # told on two connections
     assert not control.servoJ(receive.getActualQ(), *SERVO)
     assert not receive.isEmergencyStopped()
 
 
 def test_program_stopped_on_the_pendant(twin, control, receive):
-    twin.fault("script_stop")
+    twin.inject("script_stop")
     wait_until(lambda: not control.isProgramRunning())
     assert not control.servoJ(receive.getActualQ(), *SERVO)
     assert receive.getSafetyMode() == 1
 
 
 def test_local_control_refuses_a_new_client(twin):
-    twin.fault("remote_control_off")
+    twin.inject("remote_control_off")
     with pytest.raises(RuntimeError, match="remote control"):
         rtde_control.RTDEControlInterface(twin.address, RATE)
 
 
 def test_dashboard_gone(twin):
-    twin.fault("dashboard_gone")
+    twin.inject("dashboard_gone")
     with pytest.raises(RuntimeError, match="dashboard"):
         dashboard_client.DashboardClient(twin.address).connect(500)
     twin.clear()

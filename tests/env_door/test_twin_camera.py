@@ -76,7 +76,7 @@ def test_faults(watching, fault):
     twin, camera = watching
     before = camera.async_read(timeout_ms=5000)
     assert before.any()
-    twin.fault(fault)
+    twin.inject(fault)
     time.sleep(0.5)
     twin.reset(seed=7)
     try:
