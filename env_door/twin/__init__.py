@@ -3,8 +3,8 @@
 `python -m env_door.twin` runs one; `TwinProcess` runs one for a test. A client cannot tell it from a robot by its
 protocols: `ur_rtde`'s interfaces, sockets of the gripper's URCap and LeRobot's `zmq` camera connect to it.
 
-Reading order: `server` (ports and clock) -> `rtde`, `script`, `dashboard`, `gripper`, `camera` (the protocols) ->
-`controller`, `motion`, `live_door` (what they act on) -> `injections` (what can be made to fail).
+Reading order: `server` and `ports` (the clock, and who is served) -> `rtde`, `script`, `gripper`, `camera` (protocols)
+-> `controller`, `motion`, `live_door` (what they act on) -> `injections` (what can be made to fail).
 """
 
 from env_door.twin.client import TwinClient, TwinError, TwinProcess, free_address

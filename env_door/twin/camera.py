@@ -12,7 +12,6 @@ import json
 import multiprocessing
 import signal
 import time
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -25,12 +24,11 @@ from env_door.rendering import make_renderer
 from env_door.scene import load_model
 from env_door.twin import ports
 
-NAME = "front"
-"""Name of the camera in the scene and in the messages."""
-
+NAME = "front"  # of the camera in the scene and in the messages
 WIDTH, HEIGHT = 640, 480
 JPEG_QUALITY = 90
 START_SECONDS = 60.0
+MODE, DRAWN, OFFSET, POSE = 0, 1, 2, slice(3, None)  # where both processes find what they share
 
 try:
     import zmq
@@ -47,16 +45,6 @@ class CameraMode(IntEnum):
     GONE = 3
 
 
-@dataclass
-class _Shared:
-    """What both processes see. No lock: a pose mixed from two moments 2 ms apart is only a rolling shutter."""
-
-    pose: Any
-    doorway: Any
-    mode: Any
-    drawn: Any
-
-
 class Camera:
     """The camera as the twin's process sees it, of a scene with so many joint positions (`nq`)."""
 
@@ -66,16 +54,12 @@ class Camera:
                 "the twin's camera needs pyzmq: pip install 'lerobot[pyzmq-dep]', or start the twin with --camera=false"
             )
         context = multiprocessing.get_context("spawn")
-        self._shared = _Shared(
-            pose=context.RawArray("d", num_positions),
-            doorway=context.RawArray("d", 3),
-            mode=context.RawValue("i", CameraMode.NORMAL),
-            drawn=context.RawValue("l", 0),
-        )
-        self._pose, self._doorway = np.frombuffer(self._shared.pose), np.frombuffer(self._shared.doorway)
+        # No lock: a pose mixed from two moments 2 ms apart is only a rolling shutter.
+        shared = context.RawArray("d", POSE.start + num_positions)
+        self._shared = np.frombuffer(shared)
         self._answer, theirs = context.Pipe(duplex=False)
         endpoint = f"tcp://{address}:{ports.CAMERA}"
-        self._process = context.Process(target=_run, args=(endpoint, fps, self._shared, theirs), daemon=True)
+        self._process = context.Process(target=_run, args=(endpoint, fps, shared, theirs), daemon=True)
 
     def start(self) -> None:
         """Starts the process and waits until it publishes; raises a RuntimeError if it does not."""
@@ -85,24 +69,23 @@ class Camera:
             self.close()
             raise RuntimeError(f"the twin's camera did not start: {problem}")
 
-    def show(self, pose: NDArray[np.float64], doorway: NDArray[np.float64]) -> None:
-        """Tells where everything is now: the scene's joint positions, and the doorway in m."""
-        self._pose[:] = pose
-        self._doorway[:] = doorway
+    def show(self, pose: NDArray[np.float64], door_offset: float) -> None:
+        """Tells where everything is now: the scene's joint positions, and the door's sideways shift in m."""
+        self._shared[POSE], self._shared[OFFSET] = pose, door_offset
 
     @property
     def mode(self) -> CameraMode:
         """What the camera does."""
-        return CameraMode(self._shared.mode.value)
+        return CameraMode(self._shared[MODE])
 
     @mode.setter
     def mode(self, mode: CameraMode) -> None:
-        self._shared.mode.value = int(mode)
+        self._shared[MODE] = mode
 
     @property
     def drawn(self) -> int:
         """Pictures drawn so far."""
-        return self._shared.drawn.value
+        return int(self._shared[DRAWN])
 
     def close(self) -> None:
         """Ends the process."""
@@ -118,15 +101,16 @@ class _View:
         self._model = load_model("ur5e")
         self._data = mujoco.MjData(self._model)
         self._doorway = int(self._model.body("doorway").id)
+        self._home = float(self._model.body_pos[self._doorway, 1])
         # A square as wide as the picture, whose middle rows have the camera's own field of view.
         index = int(self._model.camera(NAME).id)
         half = np.tan(np.radians(self._model.cam_fovy[index]) / 2) * WIDTH / HEIGHT
         self._model.cam_fovy[index] = 2 * np.degrees(np.arctan(half))
         self._renderer = make_renderer(self._model, NAME, WIDTH)
 
-    def draw(self, pose: NDArray[np.float64], doorway: NDArray[np.float64]) -> NDArray[np.uint8]:
+    def draw(self, pose: NDArray[np.float64], door_offset: float) -> NDArray[np.uint8]:
         self._data.qpos[:] = pose
-        self._model.body_pos[self._doorway] = doorway
+        self._model.body_pos[self._doorway, 1] = self._home + door_offset
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         margin = (WIDTH - HEIGHT) // 2
@@ -142,7 +126,7 @@ def encode(picture: NDArray[np.uint8], timestamp: float) -> bytes:
     return json.dumps(message).encode()
 
 
-def _run(endpoint: str, fps: float, shared: _Shared, answer: Any) -> None:
+def _run(endpoint: str, fps: float, raw: Any, answer: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     context = zmq.Context()
     try:
@@ -152,12 +136,12 @@ def _run(endpoint: str, fps: float, shared: _Shared, answer: Any) -> None:
         answer.send(f"{endpoint}: {error}")
         return
     answer.send(None)
-    pose, doorway = np.frombuffer(shared.pose), np.frombuffer(shared.doorway)
+    shared = np.frombuffer(raw)
     parent = multiprocessing.parent_process()
     watched, message = False, b""
     due = time.monotonic()
     while parent is not None and parent.is_alive():
-        mode = CameraMode(shared.mode.value)
+        mode = CameraMode(shared[MODE])
         if (mode == CameraMode.GONE) != (socket is None):
             if socket is not None:
                 socket.close(linger=0)
@@ -169,8 +153,8 @@ def _run(endpoint: str, fps: float, shared: _Shared, answer: Any) -> None:
             if mode == CameraMode.BLACK:
                 message = encode(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.time())
             elif mode == CameraMode.NORMAL or not message:
-                message = encode(view.draw(pose.copy(), doorway.copy()), time.time())
-                shared.drawn.value += 1
+                message = encode(view.draw(shared[POSE], shared[OFFSET]), time.time())
+                shared[DRAWN] += 1
             socket.send(message)
         due = max(due + 1 / fps, time.monotonic())
         time.sleep(max(0.0, due - time.monotonic()))

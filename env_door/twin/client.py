@@ -2,7 +2,7 @@
 
 import json
 import os
-import selectors
+import select
 import socket
 import subprocess
 import sys
@@ -13,9 +13,7 @@ from typing import Any
 from env_door.twin import ports
 
 REQUEST_SECONDS = 10.0
-
-READY = "ready"
-"""What a twin prints once it listens."""
+READY = "ready"  # what a twin prints once it listens
 
 
 class TwinError(RuntimeError):
@@ -23,33 +21,17 @@ class TwinError(RuntimeError):
 
 
 class TwinClient:
-    """Asks a twin that runs somewhere.
+    """Asks a twin that runs at an address.
 
-    Args:
-        address (`str`, *optional*, defaults to `"127.0.0.2"`):
-            Its address.
+    All requests raise a `TwinError` if the twin refuses, or cannot be reached.
     """
 
     def __init__(self, address: str = "127.0.0.2"):
         self.address = address
         self._socket: socket.socket | None = None
-        self._received = b""
 
     def request(self, do: str, **parameters: Any) -> dict[str, Any]:
-        """Asks for something.
-
-        Args:
-            do (`str`):
-                `"state"`, `"reset"`, `"hold"`, `"arrivals"`, `"inject"` or `"clear"`.
-            parameters (`Any`):
-                Its parameters.
-
-        Returns:
-            `dict[str, Any]`: the answer.
-
-        Raises:
-            TwinError: If the twin refuses, or cannot be reached.
-        """
+        """Asks for `"state"`, `"reset"`, `"hold"`, `"arrivals"`, `"inject"` or `"clear"`; returns the answer."""
         try:
             answer = self._exchange(json.dumps({"do": do, **parameters}).encode() + b"\n")
         except OSError as error:
@@ -94,11 +76,7 @@ class TwinClient:
         return self.request("reset", kind=kind, seed=seed, keep_arm=keep_arm)
 
     def arrivals(self) -> list[float]:
-        """When clients of RTDE wrote inputs since this was asked last: each set-point of a servo is one such package.
-
-        Returns:
-            `list[float]`: real times in s in order.
-        """
+        """Real times in s at which clients of RTDE wrote inputs, such as set-points, since this was asked last."""
         return self.request("arrivals")["arrivals"]
 
     def hold(self, seconds: float) -> None:
@@ -106,14 +84,7 @@ class TwinClient:
         self.request("hold", seconds=seconds)
 
     def inject(self, name: str, **parameters: Any) -> None:
-        """Makes something fail.
-
-        Args:
-            name (`str`):
-                A key of `env_door.twin.injections.INJECTIONS`; a wrong one is answered by all names.
-            parameters (`Any`):
-                Its parameters.
-        """
+        """Makes something fail, by its name among `env_door.twin.injections.INJECTIONS`."""
         self.request("inject", name=name, **parameters)
 
     def clear(self, name: str | None = None) -> None:
@@ -121,20 +92,7 @@ class TwinClient:
         self.request("clear", name=name)
 
     def wait_for(self, seconds: float = 5.0, **expected: Any) -> dict[str, Any]:
-        """Waits until the state is as expected.
-
-        Args:
-            seconds (`float`, *optional*, defaults to `5.0`):
-                Longest time to wait in s.
-            expected (`Any`):
-                Entries of the state and the values they are to have.
-
-        Returns:
-            `dict[str, Any]`: the state.
-
-        Raises:
-            TwinError: If it does not become so in time.
-        """
+        """Waits until entries of the state have the expected values; a `TwinError` if they do not in time."""
         end = time.monotonic() + seconds
         while True:
             state = self.state()
@@ -150,19 +108,17 @@ class TwinClient:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-        self._received = b""
 
     def _exchange(self, request: bytes) -> dict[str, Any]:
         if self._socket is None:
             self._socket = socket.create_connection((self.address, ports.TWIN), timeout=REQUEST_SECONDS)
         self._socket.sendall(request)
-        while b"\n" not in self._received:
-            data = self._socket.recv(65536)
-            if not data:
+        answer = b""  # a single line, for requests go one at a time
+        while not answer.endswith(b"\n"):
+            if not (data := self._socket.recv(65536)):
                 raise ConnectionError("it hung up")
-            self._received += data
-        line, self._received = self._received.split(b"\n", 1)
-        return json.loads(line)
+            answer += data
+        return json.loads(answer)
 
 
 class TwinProcess(TwinClient):
@@ -174,31 +130,18 @@ class TwinProcess(TwinClient):
     Args:
         address (`str`, *optional*):
             Address to listen on; by default a free one.
-        kind (`str`, *optional*, defaults to `"random"`):
-            Kind of the door.
-        seed (`int`, *optional*, defaults to `0`):
-            Seed of the first trial.
         camera (`bool`, *optional*, defaults to `False`):
             Whether there is a camera: unlike on the command line not by default, for tests seldom look.
         start_seconds (`float`, *optional*, defaults to `90.0`):
             Longest time to wait until it listens, in s.
         options (`Any`):
-            Further fields of `env_door.twin.configuration.TwinConfig`.
+            Further fields of `env_door.twin.configuration.TwinConfig`, such as `kind` and `seed`.
     """
 
-    def __init__(
-        self,
-        address: str | None = None,
-        kind: str = "random",
-        seed: int = 0,
-        camera: bool = False,
-        start_seconds: float = 90.0,
-        **options: Any,
-    ):
+    def __init__(self, address: str | None = None, camera: bool = False, start_seconds: float = 90.0, **options: Any):
         super().__init__(address or free_address())
-        fields = {"address": self.address, "kind": kind, "seed": seed, "camera": camera, **options}
-        flags = [f"--{name}={value}" for name, value in fields.items()]
-        self._command = [sys.executable, "-m", "env_door.twin", "--until_stdin_closes=true", *flags]
+        flags = {"address": self.address, "camera": camera, "until_stdin_closes": True, **options}
+        self._command = [sys.executable, "-m", "env_door.twin", *(f"--{key}={value}" for key, value in flags.items())]
         self._start_seconds = start_seconds
         self._process: subprocess.Popen[bytes] | None = None
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (closed in `stop`)
@@ -217,13 +160,9 @@ class TwinProcess(TwinClient):
 
     def start(self) -> None:
         """Starts the process and waits until it listens; raises a TwinError if it does not."""
-        self._process = subprocess.Popen(
-            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, env=dict(os.environ)
-        )
+        self._process = subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log)
         assert self._process.stdout is not None
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._process.stdout, selectors.EVENT_READ)
-            answered = selector.select(self._start_seconds)
+        answered, _, _ = select.select([self._process.stdout], [], [], self._start_seconds)
         if not answered or self._process.stdout.readline().decode().strip() != READY:
             log = self.log()
             self.stop()
@@ -251,14 +190,7 @@ class TwinProcess(TwinClient):
 
 
 def free_address() -> str:
-    """A loopback address on which no twin listens, so that tests can run side by side.
-
-    Returns:
-        `str`: an IPv4 address in 127.0.0.0/8, all of which is this machine on Linux.
-
-    Raises:
-        TwinError: If none is free.
-    """
+    """A loopback address on which no twin listens; on Linux all of 127.0.0.0/8 is this machine."""
     for attempt in range(100):
         number = (os.getpid() * 100 + attempt) % (250 * 250)
         address = f"127.1.{number // 250}.{number % 250 + 1}"

@@ -29,7 +29,7 @@ class TwinConfig:
     unlock_seconds: float = 5.0
     """Seconds after a protective stop before it can be unlocked, as on a real controller."""
     until_stdin_closes: bool = False
-    """Whether the twin ends with the process that holds the other end of its standard input."""
+    """Whether the twin ends with the process at the other end of its standard input, which writes nothing there."""
 
     def __post_init__(self) -> None:
         check_choice(self, "kind", (*KINDS, "random"))

@@ -1,14 +1,12 @@
-"""The robot's controller: power, safety, registers, the program that runs, and one tick of 2 ms.
+"""The robot's controller: power, safety, registers, the program that runs, one tick of 2 ms, and the pendant.
 
 What a client sees of it are modes and bits whose values are Universal Robots' own. A protective stop pauses the program
 and waits for somebody to unlock it; an emergency stop and a loss of power end it.
 """
 
+import asyncio
 import logging
-import re
-import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 
 import numpy as np
@@ -17,30 +15,24 @@ from numpy.typing import NDArray
 from env_door.twin.gripper import GripperModel
 from env_door.twin.live_door import LiveDoor
 from env_door.twin.motion import TIME_STEP, JointMotion
+from env_door.twin.ports import lines
 
 logger = logging.getLogger(__name__)
 
-DEVIATION_LIMIT = 0.5
-"""Distance in rad between target and measured joint at which the controller makes a protective stop."""
+DEVIATION_LIMIT = 0.5  # rad between target and measured joint at which the controller makes a protective stop
+STOP_DECELERATION = 10.0  # rad/s^2 when a program ends while the arm moves
+POWER_SECONDS = 0.3  # that switching on and releasing the brakes take each; some seconds on a real arm
+START_SECONDS = 0.02  # between the upload of a program and its start
+TOOL_POINT = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)  # tool centre point in the flange's frame: between the pads
 
-STOP_DECELERATION = 10.0
-"""Joint deceleration in rad/s^2 when a program ends while the arm moves."""
+STILL_LOCKED = (
+    "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking"
+)
 
-POWER_SECONDS = 0.3
-"""Time that switching on and releasing the brakes take each; some seconds on a real arm."""
-
-START_SECONDS = 0.02
-"""Time between the upload of a program and its start."""
-
-TOOL_POINT = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
-"""Tool centre point in the flange's frame: between the pads."""
-
-NUM_REGISTERS = 48
-
-MAX_ARRIVALS = 100_000
-"""How many arrivals of inputs are kept: more than 13 minutes of set-points."""
-
-_REGISTER = re.compile(r"(input|output)_(int|double)_register_(\d+)")
+VERSION = (5, 15, 0, 126271)  # of the controller's software that clients are told
+REGISTERS = [
+    f"{way}_{kind}_register_{i}" for way in ("input", "output") for kind in ("int", "double") for i in range(48)
+]
 
 
 class RobotMode(IntEnum):
@@ -72,65 +64,33 @@ class ScriptError(Exception):
     """The running program did something that ends it."""
 
 
-class Registers:
-    """The letter box between a client and the program: 48 registers of each type and direction.
-
-    As on a real controller they keep their values when a client leaves.
+class Controller:
+    """State of the controller, the arm's motion, the gripper and the scene.
 
     Attributes:
-        updated (`dict[str, float]`): Controller time in s at which an input variable was last written.
-        arrivals (`deque[float]`): Real time in s, `time.monotonic()`, at which the last data packages came.
-        owners (`dict[str, object]`): Which connection writes an input variable; a second one is refused.
+        registers (`dict[str, float]`):
+            The letter box between a client and the program, by RTDE's names. As on a real controller registers keep
+            their values when a client leaves.
+        written (`dict[str, float]`): Time in s at which an input register was last written.
     """
-
-    def __init__(self) -> None:
-        self.input_int = [0] * NUM_REGISTERS
-        self.input_double = [0.0] * NUM_REGISTERS
-        self.output_int = [0] * NUM_REGISTERS
-        self.output_double = [0.0] * NUM_REGISTERS
-        self.updated: dict[str, float] = {}
-        self.arrivals: deque[float] = deque(maxlen=MAX_ARRIVALS)
-        self.owners: dict[str, object] = {}
-
-    def find(self, name: str) -> tuple[list, int] | None:
-        """The registers among which the RTDE variable of this name is, and its index; `None` if it is no register."""
-        match = _REGISTER.fullmatch(name)
-        if match is None or int(match[3]) >= NUM_REGISTERS:
-            return None
-        return getattr(self, f"{match[1]}_{match[2]}"), int(match[3])
-
-    def write_inputs(self, values: Iterable[tuple[str, float]], now: float) -> None:
-        """Takes a client's data package at a controller time; what is no register has no effect."""
-        self.arrivals.append(time.monotonic())
-        for name, value in values:
-            if (found := self.find(name)) is not None:
-                found[0][found[1]] = value
-                self.updated[name] = now
-
-    def release(self, owner: object) -> None:
-        """Lets other connections write what one that has ended wrote."""
-        self.owners = {name: holder for name, holder in self.owners.items() if holder is not owner}
-
-
-class Controller:
-    """State of the controller, the arm's motion, the gripper and the scene."""
 
     def __init__(self, door: LiveDoor, unlock_seconds: float):
         self.door = door
         self.gripper = GripperModel()
-        self.registers = Registers()
         self.motion = JointMotion(door.joint_low, door.joint_high, np.array(door.arm.joint_speed))
+        self.registers: dict[str, float] = dict.fromkeys(REGISTERS, 0)
+        self.written: dict[str, float] = {}
         self.tool_offset: NDArray[np.float64] = np.array(TOOL_POINT)
         self.time = 0.0
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
         self.program_state = ProgramState.STOPPED
         self.remote_control = True
+        self.watchdog: tuple[str, float] | None = None  # an input, and the longest time between two writes of it
         self._unlock_seconds = unlock_seconds
         self._stopped_at = 0.0
         self._program: Iterator[None] | None = None
         self._starting: tuple[float, Iterator[None]] | None = None
-        self._watchdog: tuple[str, float] | None = None
         self._switching: tuple[float, Callable[[], None]] | None = None
         self._ticks = 0
         self.gripper.switch_on(0.0)
@@ -140,11 +100,6 @@ class Controller:
     def may_move(self) -> bool:
         """Whether power and safety let a program move the arm."""
         return self.robot_mode == RobotMode.RUNNING and self.safety_mode == SafetyMode.NORMAL
-
-    @property
-    def watchdog_armed(self) -> bool:
-        """Whether the program has armed a watchdog."""
-        return self._watchdog is not None
 
     def settle(self) -> None:
         """Makes the measured pose the target: after a new trial, and when brakes close."""
@@ -161,24 +116,30 @@ class Controller:
         self._run_program()
         self.motion.step()
         self.gripper.step(self.door.closure, TIME_STEP)
-        self.door.tick(self.motion.position, self.motion.velocity, self.gripper.target)
-        if self._ticks % 10 == 0:
-            self.door.limit_grip(self.gripper.force)
-            self._check_deviation()
-            self.door.check()
+        self.door.tick(self.motion.position, self.motion.velocity, self.gripper.target, self.gripper.force)
+        deviation = np.abs(self.motion.position - self.door.joints)
+        if deviation.max() > DEVIATION_LIMIT:
+            joint = self.door.arm.joints[int(deviation.argmax())]
+            self.protective_stop(f"{joint} is {deviation.max():.2f} rad off its target")
+
+    def write_input(self, name: str, value: float) -> None:
+        """Takes what a client writes; what is no register has no effect."""
+        if name in self.registers:
+            self.registers[name] = value
+            self.written[name] = self.time
 
     def start_program(self, program: Iterator[None], name: str) -> None:
         """Starts a program, which is advanced every 2 ms, in the place of another, if the arm may be controlled."""
-        if not (self.remote_control and self.may_move):
+        if self.remote_control and self.may_move:
+            self.stop_program()
+            self._starting = (self.time + START_SECONDS, program)
+            logger.info("program %s taken", name)
+        else:
             logger.info("program %s refused: %s", name, self.describe())
-            return
-        self.stop_program()
-        self._starting = (self.time + START_SECONDS, program)
-        logger.info("program %s taken", name)
 
     def stop_program(self) -> None:
         """Ends the running program; a moving arm brakes. Watchdogs end with it, as on a real controller."""
-        self._program = self._watchdog = self._starting = None
+        self._program = self.watchdog = self._starting = None
         self.program_state = ProgramState.STOPPED
         self.motion.stop(STOP_DECELERATION)
 
@@ -187,9 +148,8 @@ class Controller:
         if self.program_state != ProgramState.PAUSED or not self.may_move:
             return False
         self.program_state = ProgramState.PLAYING
-        # A program that resumes must not take a pause for a client that has fallen silent.
-        if self._watchdog is not None:
-            self.registers.updated[self._watchdog[0]] = self.time
+        if self.watchdog is not None:  # it must not take the pause for a client that has fallen silent
+            self.written[self.watchdog[0]] = self.time
         return True
 
     def pause(self) -> bool:
@@ -201,9 +161,9 @@ class Controller:
         return True
 
     def arm_watchdog(self, name: str, min_frequency: float) -> None:
-        """Ends the program once an RTDE input is written less often than so many times a second; 0 watches no more."""
-        self._watchdog = (name, 1.0 / min_frequency) if min_frequency > 0 else None
-        self.registers.updated[name] = self.time
+        """Ends the program once an input is written less often than so many times a second; 0 watches no more."""
+        self.watchdog = (name, 1.0 / min_frequency) if min_frequency > 0 else None
+        self.written[name] = self.time
 
     def protective_stop(self, reason: str) -> None:
         """Stops at once, pauses the program and waits to be unlocked."""
@@ -242,36 +202,37 @@ class Controller:
 
     def power_on(self) -> None:
         """Switches the arm on, with brakes closed; without effect during an emergency stop."""
+
+        def finish() -> None:
+            self.robot_mode = RobotMode.IDLE
+            self.gripper.switch_on(self.door.closure)
+
         if self.robot_mode == RobotMode.POWER_OFF and self.safety_mode == SafetyMode.NORMAL:
             self.robot_mode = RobotMode.BOOTING
-            self._switching = (self.time + POWER_SECONDS, self._become_idle)
+            self._switching = (self.time + POWER_SECONDS, finish)
 
     def release_brakes(self) -> None:
         """Releases the brakes of an arm that is switched on."""
+
+        def finish() -> None:
+            self.robot_mode = RobotMode.RUNNING
+            self.settle()
+
         if self.robot_mode == RobotMode.IDLE and self.safety_mode == SafetyMode.NORMAL:
-            self._switching = (self.time + POWER_SECONDS, self._become_running)
+            self._switching = (self.time + POWER_SECONDS, finish)
 
     def describe(self) -> str:
         """What the controller is in, for logs."""
         modes = f"robot {self.robot_mode.name}, safety {self.safety_mode.name}, program {self.program_state.name}"
         return f"{modes}, {'remote' if self.remote_control else 'local'} control"
 
-    def _become_idle(self) -> None:
-        self.robot_mode = RobotMode.IDLE
-        self.gripper.switch_on(self.door.closure)
-
-    def _become_running(self) -> None:
-        self.robot_mode = RobotMode.RUNNING
-        self.settle()
-
     def _watch(self) -> None:
-        if self._watchdog is None or self.program_state != ProgramState.PLAYING:
-            return
-        name, longest = self._watchdog
-        silence = self.time - self.registers.updated[name]
-        if silence > longest:
-            logger.warning("watchdog: %s not written for %.3f s; the program ends", name, silence)
-            self.stop_program()
+        if self.watchdog is not None and self.program_state == ProgramState.PLAYING:
+            name, longest = self.watchdog
+            silence = self.time - self.written[name]
+            if silence > longest:
+                logger.warning("watchdog: %s not written for %.3f s; the program ends", name, silence)
+                self.stop_program()
 
     def _run_program(self) -> None:
         if self._starting is not None and self.time >= self._starting[0]:
@@ -281,14 +242,57 @@ class Controller:
             return
         try:
             next(self._program)
-        except StopIteration:
-            self.stop_program()
-        except ScriptError as error:
-            logger.error("the program ends: %s", error)
+        except (StopIteration, ScriptError) as end:
+            if isinstance(end, ScriptError):
+                logger.error("the program ends: %s", end)
             self.stop_program()
 
-    def _check_deviation(self) -> None:
-        deviation = np.abs(self.motion.position - self.door.joints)
-        if deviation.max() > DEVIATION_LIMIT:
-            joint = self.door.arm.joints[int(deviation.argmax())]
-            self.protective_stop(f"{joint} is {deviation.max():.2f} rad off its target")
+
+class Dashboard:
+    """The dashboard server on port 29999: what a person does on the teach pendant, as lines of text.
+
+    Replies are those of an e-Series controller, which clients compare letter by letter.
+    """
+
+    def __init__(self, controller: Controller):
+        self._controller = controller
+        # What is done, and the answers to what was done and to what could not be. A controller in local control leaves
+        # all of it to the person in front of it. Clients take any answer to `stop` but this one for a failure.
+        self._actions: dict[str, tuple[Callable[[], bool | None], str, str]] = {
+            "play": (controller.play, "Starting program", "Failed to execute: play"),
+            "pause": (controller.pause, "Pausing program", "Failed to execute: pause"),
+            "stop": (controller.stop_program, "Stopped", ""),
+            "unlock protective stop": (controller.unlock, "Protective stop releasing", STILL_LOCKED),
+            "power on": (controller.power_on, "Powering on", ""),
+            "power off": (controller.power_off, "Powering off", ""),
+            "brake release": (controller.release_brakes, "Brake releasing", ""),
+        }
+        self._questions: dict[str, Callable[[], str]] = {
+            "running": lambda: f"Program running: {str(controller.program_state == ProgramState.PLAYING).lower()}",
+            "programstate": lambda: f"{controller.program_state.name} <unnamed>",
+            "robotmode": lambda: f"Robotmode: {controller.robot_mode.name}",
+            "safetymode": lambda: f"Safetymode: {controller.safety_mode.name}",
+            "safetystatus": lambda: f"Safetystatus: {controller.safety_mode.name}",
+            "is in remote control": lambda: str(controller.remote_control).lower(),
+            "close safety popup": lambda: "closing safety popup",
+            "get serial number": lambda: "20235500001",  # without which ur_rtde's control does not connect
+            "polyscopeversion": lambda: f"URSoftware {'.'.join(map(str, VERSION))} (Oct 15 2023)",
+        }
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Carries out the commands of one client."""
+        writer.write(b"Connected: Universal Robots Dashboard Server\n")
+        async for line in lines(reader):
+            if line.lower() == "quit":
+                writer.write(b"Disconnected\n")
+                return
+            writer.write(f"{self._answer(line)}\n".encode())
+
+    def _answer(self, line: str) -> str:
+        command = line.lower()
+        if command in self._actions:
+            if not self._controller.remote_control:
+                return f"Failed to execute: {command}"
+            action, done, failed = self._actions[command]
+            return failed if action() is False else done
+        return self._questions.get(command, lambda: f"could not understand: '{line}'")()

@@ -8,29 +8,16 @@ import asyncio
 
 from env_door.twin.ports import lines
 
-OPEN, CLOSED = 3, 230
-"""Positions, of 0 to 255, at the ends of the stroke; what is asked for beyond them leads to the end."""
+OPEN, CLOSED = 3, 230  # positions, of 0 to 255, at the ends of the stroke; what is asked for beyond leads to the end
+STROKE_SPEEDS = (0.235, 1.765)  # slowest and fastest closing in strokes per second (20 and 150 mm/s of 85 mm)
+FORCES = (20.0, 235.0)  # weakest and strongest grip in N
+ACTIVATION_SECONDS = 1.0  # the real gripper closes and opens meanwhile; this one only opens
+BLOCKED_SECONDS = 0.06  # for which the fingers must stand short of the target to count as stopped by an object
 
-STROKE_SPEEDS = (0.235, 1.765)
-"""Slowest and fastest closing in strokes per second (20 and 150 mm/s of 85 mm)."""
-
-FORCES = (20.0, 235.0)
-"""Weakest and strongest grip in N; the scene's gripper ends at 140 N."""
-
-ACTIVATION_SECONDS = 1.0
-"""Time that activation takes. The real gripper closes and opens meanwhile; this one only opens."""
-
-BLOCKED_SECONDS = 0.06
-"""Time for which the fingers must stand still short of the target to count as stopped by an object."""
-
-NOT_ACTIVATED = 7
-"""Fault: asked to move before it was activated. Ends with activation."""
-
-ACTIVATING_FAULT = 5
-"""Fault: asked to move while it is being activated. Ends with activation, after which it moves."""
-
-MAJOR_FAULT = 10
-"""Faults from here on stop the gripper until it is activated again (`SET ACT 0`, then `SET ACT 1`)."""
+# Faults; those of activation end with it.
+ACTIVATING_FAULT = 5  # asked to move while it is being activated, after which it moves
+NOT_ACTIVATED = 7  # asked to move before it was activated
+MAJOR_FAULT = 10  # from here on they stop the gripper until it is activated again (`SET ACT 0`, then `SET ACT 1`)
 
 RESET, ACTIVATING, ACTIVE = 0, 1, 3
 MOVING, BLOCKED_OPENING, BLOCKED_CLOSING, AT_TARGET = 0, 1, 2, 3

@@ -7,6 +7,7 @@ the dashboard and by the client.
 import inspect
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from env_door.twin import ports
@@ -15,22 +16,13 @@ from env_door.twin.camera import CameraMode
 if TYPE_CHECKING:
     from env_door.twin.server import Twin
 
-MAX_DELAY = 10_000.0
-"""Longest delay in ms."""
-
-OVERCURRENT = 14
-"""Robotiq's code of a major fault: the gripper stops until it is activated again."""
+MAX_DELAY = 10_000.0  # ms
+OVERCURRENT = 14  # Robotiq's code of a major fault: the gripper stops until it is activated again
 
 
 @dataclass(frozen=True)
 class Injection:
-    """One thing that can be made to fail.
-
-    Attributes:
-        start (`Callable[..., None]`): Makes it happen to a twin; its keywords are parameters.
-        clear (`Callable[[Twin], Awaitable[None] | None]`, *optional*): Undoes it; `None` for events.
-        recovery (`str`): How one recovers from an event.
-    """
+    """One thing that can be made to fail: `start` takes the twin and parameters; `clear` is `None` for events."""
 
     start: Callable[..., None]
     clear: "Callable[[Twin], Awaitable[None] | None] | None" = None
@@ -41,11 +33,10 @@ def _port_gone(port: int) -> Injection:
     return Injection(lambda twin: twin.ports[port].shut(), lambda twin: twin.ports[port].open())
 
 
-def _gripper_flag(name: str) -> Injection:
-    return Injection(
-        lambda twin: setattr(twin.controller.gripper, name, True),
-        lambda twin: setattr(twin.controller.gripper, name, False),
-    )
+def _flag(path: str, broken: bool) -> Injection:
+    owner, name = path.rsplit(".", 1)
+    find = attrgetter(owner)
+    return Injection(lambda twin: setattr(find(twin), name, broken), lambda twin: setattr(find(twin), name, not broken))
 
 
 def _camera_mode(mode: CameraMode) -> Injection:
@@ -84,12 +75,9 @@ INJECTIONS: dict[str, Injection] = {
     "gripper_gone": _port_gone(ports.GRIPPER),
     "freeze": Injection(lambda twin: _freeze(twin, True), lambda twin: _freeze(twin, False)),
     "delay": Injection(_delay, lambda twin: setattr(twin.rtde, "delay", 0.0)),
-    "remote_control_off": Injection(
-        lambda twin: setattr(twin.controller, "remote_control", False),
-        lambda twin: setattr(twin.controller, "remote_control", True),
-    ),
-    "gripper_silent": _gripper_flag("silent"),
-    "gripper_garbage": _gripper_flag("garbage"),
+    "remote_control_off": _flag("controller.remote_control", False),
+    "gripper_silent": _flag("controller.gripper.silent", True),
+    "gripper_garbage": _flag("controller.gripper.garbage", True),
     "gripper_fault": Injection(_fail_gripper, lambda twin: twin.controller.gripper.fail(0)),
     "camera_freeze": _camera_mode(CameraMode.FROZEN),
     "camera_black": _camera_mode(CameraMode.BLACK),
@@ -120,13 +108,11 @@ class Injections:
     def start(self, name: str, **parameters: Any) -> None:
         """Makes something fail; raises a ValueError if it does not exist, or a parameter is unknown or out of range."""
         injection = _find(name)
-        signature = inspect.signature(injection.start)
         try:
-            signature.bind(self._twin, **parameters)
+            injection.start(self._twin, **parameters)
         except TypeError as error:
-            known = list(signature.parameters)[1:]
+            known = list(inspect.signature(injection.start).parameters)[1:]
             raise ValueError(f"injection {name!r}: {error}; its parameters are {known}") from error
-        injection.start(self._twin, **parameters)
         if injection.clear is not None and name not in self.active:
             self.active.append(name)
 

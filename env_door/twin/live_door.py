@@ -9,42 +9,23 @@ from numpy.typing import NDArray
 from env_door.env import DoorEnv
 from env_door.kinematics import rotation_about, rotation_vector
 
-GRIP_FORCE = 140.0
-"""Largest force in N with which the gripper of the scene can squeeze."""
+GRIP_FORCE = 140.0  # largest force in N with which the gripper of the scene can squeeze
 
 
 class LiveDoor(DoorEnv):
     """The scene with a UR5e, for a controller that sets a new target every 2 ms.
 
     The targets come from the controller, which has limits of its own: those of `DoorEnv.limit_action` do not apply.
-
-    Args:
-        kind (`str`, *optional*, defaults to `"random"`), door_offset (`float`, *optional*, defaults to `0.0`),
-        hold_seconds (`float`, *optional*, defaults to `0.0`):
-            As in `DoorEnv`.
     """
 
     def __init__(self, kind: str = "random", door_offset: float = 0.0, hold_seconds: float = 0.0):
         super().__init__(kind=kind, arm="ur5e", door_offset=door_offset, hold_seconds=hold_seconds)
         self._dofs = np.array([self.model.joint(name).dofadr[0] for name in self.arm.joints])
-        self._base = int(self.model.body("base").id)
-        self._flange = int(self.model.body("flange").id)
+        self._base, self._flange = (int(self.model.body(name).id) for name in ("base", "flange"))
         self.joint_low, self.joint_high = self._low[:-1], self._high[:-1]
 
     def place(self, seed: int | None, kind: str | None, keep_arm: bool) -> None:
-        """Starts a trial: closes the door and, unless told otherwise, puts the arm in front of it. Draws no picture.
-
-        Args:
-            seed (`int | None`):
-                Seed of all draws; `None` goes on with the last one's.
-            kind (`str | None`):
-                Kind of the door; `None` for the one given to the constructor.
-            keep_arm (`bool`):
-                Whether arm and fingers stay where they are.
-
-        Raises:
-            ValueError: If the kind is unknown.
-        """
+        """Starts a trial like `reset`, and draws no picture; `keep_arm` leaves arm and fingers where they are."""
         joints, fingers = self.data.qpos[self._qpos].copy(), self.data.qpos[self._fingers].copy()
         super().reset(seed=seed, options={} if kind is None else {"kind": kind})
         if keep_arm:
@@ -55,19 +36,15 @@ class LiveDoor(DoorEnv):
         # The camera is a process of its own: `reset` would draw here only to throw the picture away.
         return {}
 
-    def tick(self, joints: NDArray[np.float64], velocity: NDArray[np.float64], closure: float) -> None:
-        """Moves the scene by one physics step of 2 ms towards joint targets (rad, rad/s) and a gripper target."""
+    def tick(
+        self, joints: NDArray[np.float64], velocity: NDArray[np.float64], closure: float, grip_force: float
+    ) -> None:
+        """Moves the scene by 2 ms towards joint targets (rad, rad/s); raises a RuntimeError if the physics diverged."""
+        force = min(grip_force, GRIP_FORCE)
+        self.model.actuator_forcerange[self._actuators[-1]] = (-force, force)
         self._step_physics(self._control(np.append(joints, closure), np.append(velocity, 0.0)))
         self._hold_if_due()
-
-    def check(self) -> None:
-        """Raises a RuntimeError if the physics diverged; too dear for every step."""
         self._check_physics()
-
-    def limit_grip(self, force: float) -> None:
-        """Limits the force in N with which the gripper squeezes."""
-        force = min(force, GRIP_FORCE)
-        self.model.actuator_forcerange[self._actuators[-1]] = (-force, force)
 
     @property
     def joints(self) -> NDArray[np.float64]:
@@ -88,11 +65,6 @@ class LiveDoor(DoorEnv):
     def closure(self) -> float:
         """Measured closure of the gripper, 0 open to 1 closed."""
         return float(self.measured_joints()[-1])
-
-    @property
-    def doorway(self) -> NDArray[np.float64]:
-        """Where the doorway stands in m, shape `(3,)`."""
-        return self.model.body_pos[self._doorway]
 
     def tool_pose(self, offset: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pose in the base frame of a tool centre point in the flange's, both in m and as rotation vector, `(6,)`."""

@@ -14,21 +14,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-TIME_STEP = 0.002
-"""Seconds between two targets (500 Hz, the e-Series' own rate)."""
-
-MAX_ACCELERATION = 40.0
-"""Largest joint acceleration in rad/s^2; also the largest that the client lets one ask for."""
-
-STILL = 1e-3
-"""Joint speed in rad/s below which a motion counts as stopped."""
+TIME_STEP = 0.002  # seconds between two targets (500 Hz, the e-Series' own rate)
+MAX_ACCELERATION = 40.0  # of a joint in rad/s^2; also the largest that the client lets one ask for
+STILL = 1e-3  # joint speed in rad/s below which a motion counts as stopped
 
 
 class JointMotion:
     """The joint target, its velocity (rad, rad/s), and the one motion that changes them.
 
     Attributes:
-        kind (`str`): `"hold"`, `"servo"`, `"speed"`, `"move"` or `"stop"`.
+        kind (`str`): `"hold"`, `"servo"`, `"move"` or `"stop"`.
     """
 
     def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], max_speed: NDArray[np.float64]):
@@ -47,14 +42,8 @@ class JointMotion:
         self._lookahead, self._gain = lookahead, gain
         self.kind = "servo"
 
-    def speed(self, velocity: NDArray[np.float64], acceleration: float) -> None:
-        """Speeds up to some joint speeds and keeps them."""
-        self._goal = np.clip(velocity, -self._max_speed, self._max_speed)
-        self._acceleration = min(acceleration, MAX_ACCELERATION)
-        self.kind = "speed"
-
     def move(self, target: NDArray[np.float64], speed: float, acceleration: float) -> None:
-        """Moves on a straight line in joint space; speed and acceleration are those of the joint with the longest way."""
+        """Moves on a straight line in joint space; speed and acceleration are of the joint with the longest way."""
         self._start, self._goal = self.position.copy(), np.clip(target, self._low, self._high)
         self._distance = float(np.abs(self._goal - self._start).max())
         self._acceleration = min(max(acceleration, 1e-3), MAX_ACCELERATION)
@@ -74,8 +63,6 @@ class JointMotion:
         if self.kind == "servo":
             ahead = self.position + self._lookahead * self.velocity
             self._accelerate(self._gain * (self._goal - ahead), MAX_ACCELERATION)
-        elif self.kind == "speed":
-            self._accelerate((self._goal - self.velocity) / TIME_STEP, self._acceleration)
         elif self.kind == "stop":
             self._accelerate(-self.velocity / TIME_STEP, self._acceleration)
             if np.abs(self.velocity).max() < STILL:

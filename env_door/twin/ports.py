@@ -4,17 +4,16 @@ import asyncio
 import errno
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
 
 RTDE = 30004
 SCRIPT = (30001, 30002, 30003)
 DASHBOARD = 29999
 GRIPPER = 63352
 CAMERA = 5555
-TWIN = 5556
-"""What no real robot offers: new trials, the door's state, and making things fail."""
+TWIN = 5556  # what no real robot offers: new trials, the door's state, and making things fail
 
-MAX_MESSAGE = 1_000_000
-"""Bytes after which a client that does not end its message is hung up on."""
+MAX_MESSAGE = 1_000_000  # bytes after which a client that does not end its message is hung up on
 
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
@@ -54,21 +53,21 @@ class Port:
         """Takes nothing in while all connections stay open and new ones wait, or goes on doing so."""
         self._frozen = frozen
         for writer in self._writers:
-            self._pause(writer)
+            self._pause_if_frozen(writer.transport)
 
-    def _pause(self, writer: asyncio.StreamWriter) -> None:
-        transport = writer.transport
-        assert isinstance(transport, asyncio.ReadTransport)
+    def _pause_if_frozen(self, transport: Any) -> None:
         if not transport.is_closing():
             (transport.pause_reading if self._frozen else transport.resume_reading)()
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
-        self._pause(writer)
+        self._pause_if_frozen(writer.transport)
         try:
+            # asyncio does this only for listeners that it has made itself.
+            writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._server is not None:
                 await self._serve(reader, writer)
-        except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, ConnectionError):
+        except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
             pass  # the client left, or sends without end
         finally:
             self._writers.discard(writer)

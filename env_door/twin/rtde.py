@@ -8,39 +8,28 @@ Names and types are those of Universal Robots' RTDE guide.
 import asyncio
 import logging
 import struct
+import time
 from collections import deque
 from collections.abc import Callable
-from enum import IntEnum
 
-from env_door.twin.controller import Controller, ProgramState, RobotMode, SafetyMode
+from env_door.twin.controller import REGISTERS, VERSION, Controller, ProgramState, RobotMode, SafetyMode
 from env_door.twin.motion import TIME_STEP
 
 logger = logging.getLogger(__name__)
 
-VERSION = (5, 15, 0, 126271)
-"""Version of the controller's software that clients are told."""
-
 HEADER = struct.Struct(">HB")
+MAX_ARRIVALS = 100_000  # times of set-points that are kept: more than 13 minutes
 
-TYPES = {
-    "BOOL": "?",
-    "UINT8": "B",
-    "UINT32": "I",
-    "UINT64": "Q",
-    "INT32": "i",
-    "DOUBLE": "d",
-    "VECTOR3D": "3d",
-    "VECTOR6D": "6d",
-    "VECTOR6INT32": "6i",
-    "VECTOR6UINT32": "6I",
-}
-"""RTDE's types as formats of Python's `struct`."""
+FORMATS = {"UINT8": "B", "UINT32": "I", "UINT64": "Q", "INT32": "i", "DOUBLE": "d"}
+FORMATS |= {"VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i"}
 
 
 def _by_name(**names: str) -> dict[str, str]:
-    return {name: kind for kind, group in names.items() for name in group.split()}
+    registers = {name: "INT32" if "_int_" in name else "DOUBLE" for name in REGISTERS}
+    return registers | {name: kind for kind, group in names.items() for name in group.split()}
 
 
+# What a client may ask for; what has no counterpart in the scene reads 0.
 OUTPUTS = _by_name(
     DOUBLE="""timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum actual_main_voltage
         actual_robot_voltage actual_robot_current standard_analog_input0 standard_analog_input1 standard_analog_output0
@@ -55,8 +44,7 @@ OUTPUTS = _by_name(
         output_bit_registers32_to_63""",
     UINT64="actual_digital_input_bits actual_digital_output_bits",
 )
-"""What a client may ask for beside registers; what has no counterpart in the scene reads 0."""
-
+# What a client may write; only registers have an effect.
 INPUTS = _by_name(
     DOUBLE="speed_slider_fraction standard_analog_output_0 standard_analog_output_1",
     VECTOR6D="external_force_torque",
@@ -65,10 +53,9 @@ INPUTS = _by_name(
         configurable_digital_output tool_digital_output_mask tool_digital_output standard_analog_output_mask
         standard_analog_output_type""",
 )
-"""What a client may write beside registers; taken, and without effect here."""
+INPUTS = {name: kind for name, kind in INPUTS.items() if not name.startswith("output_")}
 
 JOINT_MODES = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255, RobotMode.BOOTING: 247, RobotMode.POWER_OFF: 239}
-
 SAFETY_BITS = {
     SafetyMode.NORMAL: 1 << 0,
     SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
@@ -78,18 +65,6 @@ SAFETY_BITS = {
 Reading = Callable[[], tuple[float, ...]]
 
 
-class Package(IntEnum):
-    """Types of packages."""
-
-    PROTOCOL_VERSION = ord("V")
-    CONTROLLER_VERSION = ord("v")
-    DATA = ord("U")
-    OUTPUTS = ord("O")
-    INPUTS = ord("I")
-    START = ord("S")
-    PAUSE = ord("P")
-
-
 class RTDEServer:
     """All clients of RTDE.
 
@@ -97,6 +72,8 @@ class RTDEServer:
         sessions (`set[RTDESession]`): The clients.
         delay (`float`): Seconds by which measurements reach the clients late.
         frozen (`bool`): Whether measurements are withheld.
+        arrivals (`deque[float]`): Real time in s, `time.monotonic()`, at which the last inputs came.
+        owners (`dict[str, RTDESession]`): Who writes an input; a second one is refused.
     """
 
     def __init__(self, controller: Controller):
@@ -104,6 +81,8 @@ class RTDEServer:
         self.sessions: set[RTDESession] = set()
         self.delay = 0.0
         self.frozen = False
+        self.arrivals: deque[float] = deque(maxlen=MAX_ARRIVALS)
+        self.owners: dict[str, RTDESession] = {}
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answers the packages of one client; hangs up at a malformed one."""
@@ -112,12 +91,18 @@ class RTDEServer:
         try:
             while True:
                 size, kind = HEADER.unpack(await reader.readexactly(HEADER.size))
-                session.handle(kind, await reader.readexactly(size - HEADER.size))
+                session.handle(chr(kind), await reader.readexactly(size - HEADER.size))
         except (struct.error, ValueError) as error:
             logger.warning("RTDE client sent a malformed package (%s): hung up", error)
         finally:
             self.sessions.discard(session)
-            self.controller.registers.release(session)
+            self.owners = {name: owner for name, owner in self.owners.items() if owner is not session}
+
+    def take_arrivals(self) -> list[float]:
+        """The times at which inputs came, since this was asked last."""
+        times = list(self.arrivals)
+        self.arrivals.clear()
+        return times
 
     def publish(self) -> None:
         """Sends measurements to all clients whose turn it is; called every 2 ms."""
@@ -126,11 +111,10 @@ class RTDEServer:
                 session.publish()
 
     def reading(self, name: str) -> Reading:
-        """A function that reads an output variable or register, looked up once and called at every package."""
+        """A function that reads an output, looked up once and called at every package."""
         controller, door, motion = self.controller, self.controller.door, self.controller.motion
-        if (found := controller.registers.find(name)) is not None:
-            registers, index = found
-            return lambda: (registers[index],)
+        if name in controller.registers:
+            return lambda: (controller.registers[name],)
         known: dict[str, Reading] = {
             "timestamp": lambda: (controller.time,),
             "target_q": lambda: tuple(motion.position),
@@ -145,9 +129,6 @@ class RTDEServer:
             "safety_status": lambda: (controller.safety_mode,),
             "speed_scaling": lambda: (float(controller.may_move),),
             "target_speed_fraction": lambda: (1.0,),
-            "actual_main_voltage": lambda: (48.0,),
-            "actual_robot_voltage": lambda: (48.0 if controller.robot_mode != RobotMode.POWER_OFF else 0.0,),
-            "joint_temperatures": lambda: (30.0,) * 6,
             "runtime_state": lambda: (controller.program_state,),
             "robot_status_bits": self._status_bits,
             "safety_status_bits": lambda: (SAFETY_BITS[controller.safety_mode],),
@@ -155,15 +136,9 @@ class RTDEServer:
         zeros = (0,) * _count(OUTPUTS[name])
         return known.get(name, lambda: zeros)
 
-    def type_of(self, name: str, known: dict[str, str]) -> str:
-        """RTDE's type of a register or of one of the `known` variables, or what it answers for neither."""
-        if self.controller.registers.find(name) is not None:
-            return "INT32" if "_int_" in name else "DOUBLE"
-        return known.get(name, "NOT_FOUND")
-
     def _status_bits(self) -> tuple[int]:
         powered = self.controller.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING)
-        return (int(powered) | (self.controller.program_state == ProgramState.PLAYING) << 1,)
+        return (powered | (self.controller.program_state == ProgramState.PLAYING) << 1,)
 
 
 class RTDESession:
@@ -171,7 +146,6 @@ class RTDESession:
 
     def __init__(self, server: RTDEServer, writer: asyncio.StreamWriter):
         self._server, self._writer = server, writer
-        self._registers = server.controller.registers
         self._inputs: dict[int, tuple[list[str], struct.Struct]] = {}
         self._readings: list[Reading] = []
         self._format = struct.Struct(">B")
@@ -183,73 +157,73 @@ class RTDESession:
     def publish(self) -> None:
         """Sends the measurements if it is time for them; called every 2 ms."""
         self._ticks += 1
-        time = self._server.controller.time
-        while self._late and self._late[0][0] <= time:
-            self._send(Package.DATA, self._late.popleft()[1])
+        now = self._server.controller.time
+        while self._late and self._late[0][0] <= now:
+            self._send("U", self._late.popleft()[1])
         # A controller that cannot keep up skips packages rather than to send old ones.
         if not self._started or self._ticks % self._every or self._writer.transport.get_write_buffer_size():
             return
         body = self._format.pack(1, *(value for reading in self._readings for value in reading()))
         if self._server.delay > 0 or self._late:
-            self._late.append((time + self._server.delay, body))
+            self._late.append((now + self._server.delay, body))
         else:
-            self._send(Package.DATA, body)
+            self._send("U", body)
 
-    def handle(self, kind: int, body: bytes) -> None:
+    def handle(self, kind: str, body: bytes) -> None:
         """Takes in a package and answers it; raises a ValueError or `struct.error` if it is malformed."""
         match kind:
-            case Package.DATA:
+            case "U":  # inputs
                 if not body or body[0] not in self._inputs:
                     raise ValueError(f"unknown input recipe {body[:1].hex() or 'none'}")
                 names, layout = self._inputs[body[0]]
-                values = zip(names, layout.unpack(body[1:]), strict=True)
-                self._registers.write_inputs(values, self._server.controller.time)
-            case Package.PROTOCOL_VERSION:
+                for name, value in zip(names, layout.unpack(body[1:]), strict=True):
+                    self._server.controller.write_input(name, value)
+                self._server.arrivals.append(time.monotonic())
+            case "V":  # version of the protocol
                 self._send(kind, struct.pack(">?", struct.unpack(">H", body)[0] == 2))
-            case Package.CONTROLLER_VERSION:
+            case "v":  # version of the controller
                 self._send(kind, struct.pack(">4I", *VERSION))
-            case Package.OUTPUTS:
+            case "O":
                 self._send(kind, self._agree_on_outputs(body))
-            case Package.INPUTS:
+            case "I":
                 self._send(kind, self._agree_on_inputs(body))
-            case Package.START:
+            case "S":  # start
                 self._started = bool(self._readings)
                 self._send(kind, struct.pack(">?", self._started))
-            case Package.PAUSE:
+            case "P":  # pause
                 self._started = False
                 self._send(kind, struct.pack(">?", True))
             case _:
-                logger.warning("RTDE package of unknown type %d ignored", kind)
+                logger.warning("RTDE package of unknown type %r ignored", kind)
 
     def _agree_on_outputs(self, body: bytes) -> bytes:
         (frequency,), names = struct.unpack_from(">d", body), _names(body[8:])
-        types = [self._server.type_of(name, OUTPUTS) for name in names]
+        types = [OUTPUTS.get(name, "NOT_FOUND") for name in names]
+        answer = ",".join(types).encode()
         if "NOT_FOUND" in types or not names or not 1 <= frequency <= 1 / TIME_STEP:
             self._readings = []
-            return b"\x00" + ",".join(types).encode()
+            return b"\x00" + answer
         self._every = max(1, round(1 / (TIME_STEP * frequency)))
         self._readings = [self._server.reading(name) for name in names]
-        self._format = struct.Struct(">B" + "".join(TYPES[one] for one in types))
-        return b"\x01" + ",".join(types).encode()
+        self._format = struct.Struct(">B" + "".join(FORMATS[one] for one in types))
+        return b"\x01" + answer
 
     def _agree_on_inputs(self, body: bytes) -> bytes:
-        names, owners = _names(body), self._registers.owners
-        types = ["IN_USE" if owners.get(name, self) is not self else self._input_type(name) for name in names]
-        if any(one not in TYPES for one in types):
-            return b"\x00" + ",".join(types).encode()
+        names, owners = _names(body), self._server.owners
+        types = ["IN_USE" if owners.get(name, self) is not self else INPUTS.get(name, "NOT_FOUND") for name in names]
+        answer = ",".join(types).encode()
+        if not set(types) <= set(FORMATS):
+            return b"\x00" + answer
         owners.update(dict.fromkeys(names, self))
         identity = len(self._inputs) + 1
         # One name for each number: no vector is a register, so what its numbers are called does not matter.
         fields = [name for name, one in zip(names, types, strict=True) for _ in range(_count(one))]
-        self._inputs[identity] = (fields, struct.Struct(">" + "".join(TYPES[one] for one in types)))
-        return bytes([identity]) + ",".join(types).encode()
+        self._inputs[identity] = (fields, struct.Struct(">" + "".join(FORMATS[one] for one in types)))
+        return bytes([identity]) + answer
 
-    def _input_type(self, name: str) -> str:
-        return "NOT_FOUND" if name.startswith("output_") else self._server.type_of(name, INPUTS)
-
-    def _send(self, kind: int, body: bytes) -> None:
+    def _send(self, kind: str, body: bytes) -> None:
         if not self._writer.is_closing():
-            self._writer.write(HEADER.pack(HEADER.size + len(body), kind) + body)
+            self._writer.write(HEADER.pack(HEADER.size + len(body), ord(kind)) + body)
 
 
 def _names(body: bytes) -> list[str]:
@@ -257,4 +231,4 @@ def _names(body: bytes) -> list[str]:
 
 
 def _count(kind: str) -> int:
-    return int(TYPES[kind][:-1] or 1)
+    return int(FORMATS[kind][:-1] or 1)

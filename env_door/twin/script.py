@@ -12,7 +12,7 @@ once, answer 2 and wait until the client has put back 0.
 import asyncio
 import logging
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +25,8 @@ logger = logging.getLogger(__name__)
 
 READY, DONE = 1, 2
 STOP_SCRIPT = 255
-STREAMED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}
-"""Commands that the script reads anew every 2 ms."""
-
-STILL = 0.01
-"""Joint speed in rad/s below which the arm counts as steady."""
+STREAMED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}  # read anew every 2 ms
+STILL = 0.01  # joint speed in rad/s below which the arm counts as steady
 
 _NAME = re.compile(r"^def\s+(\w+)\s*\(", re.MULTILINE)
 _OFFSET = re.compile(r"global reg_offset_int = # int register offset\s+(\d+)")
@@ -55,31 +52,11 @@ class UploadedScript:
     """One run of ur_rtde's control script, whose source says which half of the registers it uses."""
 
     def __init__(self, controller: Controller, source: str):
-        self._controller, self._motion, self._registers = controller, controller.motion, controller.registers
+        self._controller, self._motion = controller, controller.motion
         match = _OFFSET.search(source)
         self._offset = int(match[1]) if match else 0
         self._async_writes = self._async_operations = 0
         self._async_moving = False
-        self._commands: dict[int, Callable[[], Iterator[None] | None]] = {
-            1: self._move_j,
-            8: lambda: None,  # zero_ftsensor
-            9: self._speed_j,
-            11: self._servo_j,
-            15: self._stop_speed_or_servo,
-            16: self._stop_speed_or_servo,
-            17: lambda: None,  # set_payload
-            26: lambda: self._answer_with([TIME_STEP]),
-            29: self._set_tool,
-            31: self._protective_stop,
-            33: self._stop,
-            34: self._stop,
-            35: lambda: controller.arm_watchdog(f"input_int_register_{self._offset}", self._argument(0)),
-            37: self._joints_within_limits,
-            38: lambda: self._answer_with(controller.door.joint_torques),
-            40: lambda: self._answer_with(controller.tool_offset),
-            43: lambda: self._answer_with(controller.door.tool_pose(controller.tool_offset)),
-            47: self._is_steady,
-        }
 
     def run(self) -> Iterator[None]:
         """The script's main loop; a ScriptError ends it."""
@@ -87,7 +64,7 @@ class UploadedScript:
         self._signal_async(-1)
         self._answer(0, READY)
         while True:
-            command = self._registers.input_int[self._offset]
+            command = self._integer(0)
             if command in STREAMED:
                 yield from self._carry_out(command)
                 self._answer(0, READY)
@@ -105,82 +82,82 @@ class UploadedScript:
             yield
 
     def _carry_out(self, command: int) -> Iterator[None]:
-        if command not in self._commands:
-            raise ScriptError(f"command {command} of ur_rtde is not emulated; {sorted(self._commands)} are")
-        yield from self._commands[command]() or ()
+        controller, motion, door = self._controller, self._motion, self._controller.door
+        match command:
+            case 1:  # movej
+                self._refuse_during("servo", "servoStop")
+                self._end_async_move()
+                motion.move(self._joint_arguments(), speed=self._argument(6), acceleration=self._argument(7))
+                yield from self._until_still_unless_async()
+            case 8 | 17:  # zero_ftsensor, set_payload
+                pass
+            case 11:  # servoj
+                self._refuse_during("move", "stopJ")
+                motion.servo(self._joint_arguments(), lookahead=self._argument(9), gain=self._argument(10))
+            case 16:  # servo_stop: stopl, whose unit is m/s^2; the twin brakes its joints with as many rad/s^2
+                motion.stop(self._argument(0))
+                yield from self._until_still()
+            case 26:  # get_steptime
+                self._answer_with([TIME_STEP])
+            case 29:  # set_tcp
+                controller.tool_offset = self._joint_arguments()
+            case 31:  # protective_stop
+                controller.protective_stop("asked for by the client")
+                yield  # the program is paused right here, before it could answer
+            case 33 | 34:  # stopl, stopj
+                self._refuse_during("servo", "servoStop")
+                self._end_async_move()
+                motion.stop(self._argument(0))
+                yield from self._until_still_unless_async()
+            case 35:  # set_watchdog
+                controller.arm_watchdog(f"input_int_register_{self._offset}", self._argument(0))
+            case 37:  # is_joints_within_safety_limits
+                joints = self._joint_arguments()
+                self._answer(1, int(((joints >= door.joint_low) & (joints <= door.joint_high)).all()))
+            case 38:  # get_joint_torques
+                self._answer_with(door.joint_torques)
+            case 40:  # get_tcp_offset
+                self._answer_with(controller.tool_offset)
+            case 43:  # get_forward_kinematics_default
+                self._answer_with(door.tool_pose(controller.tool_offset))
+            case 47:  # is_steady
+                self._answer(1, int(motion.kind == "hold" and np.abs(door.joint_speeds).max() < STILL))
+            case _:
+                raise ScriptError(f"command {command} of ur_rtde is not emulated")
+
+    def _integer(self, index: int) -> int:
+        return int(self._controller.registers[f"input_int_register_{self._offset + index}"])
 
     def _argument(self, index: int) -> float:
-        return self._registers.input_double[self._offset + index]
+        return self._controller.registers[f"input_double_register_{self._offset + index}"]
 
     def _joint_arguments(self) -> NDArray[np.float64]:
-        values = np.array(self._registers.input_double[self._offset : self._offset + 6])
+        values = np.array([self._argument(index) for index in range(6)])
         if not np.isfinite(values).all():
             raise ScriptError(f"arguments {values.tolist()} are not finite")
         return values
 
     def _answer(self, index: int, value: int) -> None:
-        self._registers.output_int[self._offset + index] = value
+        self._controller.registers[f"output_int_register_{self._offset + index}"] = value
 
     def _answer_with(self, values: Iterable[float]) -> None:
         for index, value in enumerate(values):
-            self._registers.output_double[self._offset + index] = float(value)
+            self._controller.registers[f"output_double_register_{self._offset + index}"] = float(value)
 
-    def _refuse_during(self, *kinds: str) -> None:
-        if self._motion.kind in kinds:
-            raise ScriptError(
-                f"another thread is already controlling the robot ({self._motion.kind}): stop it first, "
-                "a servo with servoStop, a speed with speedStop, a move with stopJ"
-            )
-
-    def _servo_j(self) -> None:
-        self._refuse_during("move", "speed")
-        self._motion.servo(self._joint_arguments(), lookahead=self._argument(9), gain=self._argument(10))
-
-    def _speed_j(self) -> None:
-        self._refuse_during("move", "servo")
-        self._motion.speed(self._joint_arguments(), acceleration=self._argument(6))
-
-    def _move_j(self) -> Iterator[None]:
-        self._refuse_during("servo", "speed")
-        self._end_async_move()
-        self._motion.move(self._joint_arguments(), speed=self._argument(6), acceleration=self._argument(7))
-        return self._until_still_or_async()
-
-    def _stop(self) -> Iterator[None]:
-        self._refuse_during("servo", "speed")
-        self._end_async_move()
-        self._motion.stop(self._argument(0))
-        return self._until_still_or_async()
-
-    def _stop_speed_or_servo(self) -> Iterator[None]:
-        # The script calls stopl for servos, whose unit is m/s^2; the twin brakes its joints with as many rad/s^2.
-        self._motion.stop(self._argument(0))
-        return self._until_still()
-
-    def _until_still_or_async(self) -> Iterator[None]:
-        if self._registers.input_int[self._offset + 1] != 1:
-            return self._until_still()
-        self._signal_async(0)
-        self._async_moving = True
-        return iter(())
+    def _refuse_during(self, kind: str, stop: str) -> None:
+        if self._motion.kind == kind:
+            raise ScriptError(f"another thread is already controlling the robot: {stop} first")
 
     def _until_still(self) -> Iterator[None]:
         while self._motion.kind != "hold":
             yield
 
-    def _set_tool(self) -> None:
-        self._controller.tool_offset = self._joint_arguments()
-
-    def _protective_stop(self) -> Iterator[None]:
-        self._controller.protective_stop("asked for by the client")
-        yield  # the program is paused right here, before it could answer
-
-    def _joints_within_limits(self) -> None:
-        joints, door = self._joint_arguments(), self._controller.door
-        self._answer(1, int(((joints >= door.joint_low) & (joints <= door.joint_high)).all()))
-
-    def _is_steady(self) -> None:
-        self._answer(1, int(self._motion.kind == "hold" and np.abs(self._controller.door.joint_speeds).max() < STILL))
+    def _until_still_unless_async(self) -> Iterator[None]:
+        if self._integer(1) == 1:
+            self._signal_async(0)
+            self._async_moving = True
+        else:
+            yield from self._until_still()
 
     def _end_async_move(self) -> None:
         if self._async_moving:
@@ -188,7 +165,7 @@ class UploadedScript:
             self._signal_async(-1)
 
     def _signal_async(self, progress: int) -> None:
-        """Output register 2: counters of writes and operations, whether one runs (bit 15) and how far it is."""
+        # Output register 2: counters of writes and operations, whether one runs (bit 15) and how far it is.
         self._async_writes = (self._async_writes + 1) % 128
         if progress == 0:
             self._async_operations = (self._async_operations + 1) % 128

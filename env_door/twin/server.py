@@ -15,8 +15,7 @@ import numpy as np
 from env_door.twin import ports
 from env_door.twin.camera import Camera
 from env_door.twin.configuration import TwinConfig
-from env_door.twin.controller import Controller
-from env_door.twin.dashboard import Dashboard
+from env_door.twin.controller import Controller, Dashboard
 from env_door.twin.injections import Injections
 from env_door.twin.live_door import LiveDoor
 from env_door.twin.motion import TIME_STEP
@@ -24,8 +23,7 @@ from env_door.twin.ports import Port, Serve, lines
 from env_door.twin.rtde import RTDEServer
 from env_door.twin.script import serve_uploads
 
-MAX_LAG = 0.25
-"""Seconds by which the twin may be late and still catch up; beyond, it lets the time go."""
+MAX_LAG = 0.25  # seconds by which the twin may be late and still catch up; beyond, it lets the time go
 
 
 class Twin:
@@ -46,7 +44,7 @@ class Twin:
             "state": self.state,
             "reset": self.reset,
             "hold": self.door.hold_door,
-            "arrivals": self._arrivals,
+            "arrivals": lambda: {"arrivals": self.rtde.take_arrivals()},
             "inject": self.injections.start,
             "clear": self.injections.clear,
         }
@@ -84,7 +82,7 @@ class Twin:
         """Goes on by 2 ms and sends what clients are to be told."""
         self.controller.tick()
         if self.camera is not None:
-            self.camera.show(self.door.data.qpos, self.door.doorway)
+            self.camera.show(self.door.data.qpos, self.door.current_offset)
         self.rtde.publish()
 
     def close(self) -> None:
@@ -117,7 +115,7 @@ class Twin:
             "robot_mode": controller.robot_mode.name,
             "safety_mode": controller.safety_mode.name,
             "program": controller.program_state.name,
-            "watchdog": controller.watchdog_armed,
+            "watchdog": controller.watchdog is not None,
             "rtde_clients": len(self.rtde.sessions),
             "injections": self.injections.active,
             "pictures": self.camera.drawn if self.camera is not None else 0,
@@ -136,11 +134,6 @@ class Twin:
             self.controller.gripper.open_at_once()
             self.controller.settle()
         return self.state()
-
-    def _arrivals(self) -> dict[str, Any]:
-        times = list(self.controller.registers.arrivals)
-        self.controller.registers.arrivals.clear()
-        return {"arrivals": times}
 
     async def _serve_requests(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answers JSON lines such as `{"do": "inject", "name": "freeze"}` with `{"ok": true, ...}`."""

@@ -11,7 +11,7 @@ from env_door.rendering import make_renderer
 from env_door.twin import TwinProcess, free_address
 from env_door.twin.camera import HEIGHT, WIDTH, encode
 from env_door.twin.configuration import TwinConfig
-from env_door.twin.twin import Twin
+from env_door.twin.server import Twin
 
 
 def picture_of_the_environment(env):
@@ -25,7 +25,7 @@ def picture_of_the_environment(env):
 def test_message_is_what_the_camera_of_lerobot_decodes():
     picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     picture[:, :, 0] = 255
-    message = json.loads(encode(picture, "front", 1.5))
+    message = json.loads(encode(picture, 1.5))
     assert message["timestamps"] == {"front": 1.5}
     # The steps of LeRobot's ZMQCamera, which hands on OpenCV's channels as they are.
     jpeg = np.frombuffer(base64.b64decode(message["images"]["front"]), np.uint8)

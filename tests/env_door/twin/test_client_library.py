@@ -30,23 +30,24 @@ def running():
 
 
 @pytest.fixture
-def twin(running):
+def twin(running, dashboard):
     yield running
     running.clear()
-    with_dashboard(running, lambda dashboard: recover(running, dashboard))
+    recover(running, dashboard)
     running.reset(seed=3)
 
 
-def with_dashboard(twin, work):
-    dashboard = dashboard_client.DashboardClient(twin.address)
-    dashboard.connect()
-    try:
-        work(dashboard)
-    finally:
-        dashboard.disconnect()
+@pytest.fixture
+def dashboard(running):
+    client = dashboard_client.DashboardClient(running.address)
+    client.connect()
+    yield client
+    client.disconnect()
 
 
 def recover(twin, dashboard):
+    if not dashboard.isConnected():
+        dashboard.connect()
     if twin.state()["safety_mode"] == "PROTECTIVE_STOP":
         wait_until(lambda: unlocked(dashboard))
     if twin.state()["robot_mode"] != "RUNNING":
@@ -91,6 +92,17 @@ def servo(control, receive, change, seconds):
     return all(answers)
 
 
+def goes_on_after_an_upload(control, receive):
+    if control.servoJ(receive.getActualQ(), *SERVO):  # nothing goes on by itself
+        return False
+    assert control.reuploadScript()
+    wait_until(control.isProgramRunning)
+    return control.servoJ(receive.getActualQ(), *SERVO)
+
+
+# ── In good order ─────────────────────────────────────────────────────
+
+
 def test_state_is_read_as_from_a_robot(twin, receive):
     state = twin.state()
     np.testing.assert_allclose(receive.getActualQ(), list(state["joints"].values())[:6], atol=1e-3)
@@ -99,7 +111,7 @@ def test_state_is_read_as_from_a_robot(twin, receive):
     assert not receive.isEmergencyStopped()
 
 
-def test_tool_pose_follows_from_the_published_geometry(twin, receive):
+def test_tool_pose_follows_from_the_published_geometry(receive):
     # Denavit-Hartenberg parameters as Universal Robots publishes them, chained here from scratch.
     d = [0.1625, 0, 0, 0.1333, 0.0997, 0.0996]
     a = [0, -0.425, -0.3922, 0, 0, 0]
@@ -107,14 +119,8 @@ def test_tool_pose_follows_from_the_published_geometry(twin, receive):
     pose = np.eye(4)
     for joint, angle in enumerate(receive.getActualQ()):
         c, s, ct, st = np.cos(angle), np.sin(angle), np.cos(twist[joint]), np.sin(twist[joint])
-        pose = pose @ np.array(
-            [
-                [c, -s * ct, s * st, a[joint] * c],
-                [s, c * ct, -c * st, a[joint] * s],
-                [0, st, ct, d[joint]],
-                [0, 0, 0, 1],
-            ]
-        )
+        turned = [[c, -s * ct, s * st, a[joint] * c], [s, c * ct, -c * st, a[joint] * s]]
+        pose = pose @ np.array([*turned, [0, st, ct, d[joint]], [0, 0, 0, 1]])
     expected = pose @ [0, 0, 0.15, 1]
     np.testing.assert_allclose(receive.getActualTCPPose()[:3], expected[:3], atol=1e-3)
 
@@ -144,21 +150,11 @@ def test_move_arrives_before_it_returns_and_asynchronously_after(twin, control, 
 
 
 def test_tool_offset_and_limits(control):
-    assert control.getTCPOffset() == pytest.approx([0, 0, 0.15, 0, 0, 0])
-    assert control.setTcp([0, 0, 0.1, 0, 0, 0])
-    assert control.getTCPOffset() == pytest.approx([0, 0, 0.1, 0, 0, 0])
-    assert control.setTcp([0, 0, 0.15, 0, 0, 0])
+    for offset in (0.1, 0.15):
+        assert control.setTcp([0, 0, offset, 0, 0, 0])
+        assert control.getTCPOffset() == pytest.approx([0, 0, offset, 0, 0, 0])
     assert control.isJointsWithinSafetyLimits([0.0] * 6)
     assert not control.isJointsWithinSafetyLimits([7.0] * 6)
-
-
-def test_stopping_the_script_and_uploading_it_again(control, receive):
-    control.stopScript()
-    assert not control.isProgramRunning()
-    assert not control.servoJ(receive.getActualQ(), *SERVO)
-    assert control.reuploadScript()
-    wait_until(control.isProgramRunning)
-    assert control.servoJ(receive.getActualQ(), *SERVO)
 
 
 def test_disconnecting_and_connecting_again(twin, control, receive):
@@ -196,128 +192,6 @@ def test_the_twin_tells_when_set_points_came(twin, control, receive):
     assert twin.arrivals() == []
 
 
-def test_watchdog_stops_the_arm_when_the_client_falls_silent(twin, control, receive):
-    assert control.setWatchdog(2.0)
-    assert servo(control, receive, [0.1, 0, 0, 0, 0, 0], 0.5)
-    assert twin.state()["program"] == "PLAYING"
-    twin.wait_for(program="STOPPED", motion="hold")
-    wait_until(lambda: not control.isProgramRunning())
-    assert not control.kickWatchdog()
-    assert not control.servoJ(receive.getActualQ(), *SERVO)
-
-
-# Faults of the link are tested with a client that only listens. One that commands connects again by itself and crashes
-# now and then: only a process of its own may hold it when a link breaks, as that of the robot's servo does.
-def test_dropped_link_leaves_stale_values_and_can_be_made_again(twin, receive):
-    twin.inject("drop_link")
-    wait_until(lambda: not receive.isConnected())
-    stale = receive.getTimestamp()
-    time.sleep(0.05)
-    assert receive.getTimestamp() == stale
-    assert len(receive.getActualQ()) == 6
-    with pytest.raises(RuntimeError, match="verify the IP"):
-        rtde_receive.RTDEReceiveInterface(twin.address, RATE)
-    twin.clear("drop_link")
-    assert receive.reconnect()
-    assert receive.getTimestamp() > stale
-
-
-def test_frozen_link_stays_connected_while_nothing_comes(twin, receive):
-    twin.inject("freeze")
-    time.sleep(0.05)
-    stale = receive.getTimestamp()
-    time.sleep(0.1)
-    assert receive.getTimestamp() == stale
-    assert receive.isConnected()
-    twin.clear()
-    wait_until(lambda: receive.getTimestamp() > stale)
-
-
-def test_frozen_for_long_the_client_gives_up(twin, receive):
-    twin.inject("freeze")
-    wait_until(lambda: not receive.isConnected())
-
-
-def test_delayed_measurements(twin, receive):
-    def lateness():
-        return twin.request("state")["controller_time"] - receive.getTimestamp()
-
-    assert lateness() < 0.15
-    twin.inject("delay", ms=400.0)
-    wait_until(lambda: lateness() > 0.35)
-    assert receive.isConnected()
-    twin.clear("delay")
-    wait_until(lambda: lateness() < 0.15)
-
-
-def test_protective_stop(twin, control, receive):
-    assert control.servoJ(receive.getActualQ(), *SERVO)
-    twin.inject("protective_stop")
-    wait_until(receive.isProtectiveStopped)
-    wait_until(lambda: not control.isProgramRunning())
-    assert not control.servoJ(receive.getActualQ(), *SERVO)
-    assert receive.getSafetyMode() == 3
-
-    def unlock(dashboard):
-        assert dashboard.safetystatus() == "Safetystatus: PROTECTIVE_STOP"
-        wait_until(lambda: unlocked(dashboard))
-
-    with_dashboard(twin, unlock)
-    wait_until(lambda: not receive.isProtectiveStopped())
-    assert not control.servoJ(receive.getActualQ(), *SERVO)
-    assert control.reuploadScript()
-    wait_until(control.isProgramRunning)
-    assert control.servoJ(receive.getActualQ(), *SERVO)
-
-
-def test_protective_stop_stops_the_moving_arm(twin, control, receive):
-    assert control.moveJ(list(np.add(receive.getActualQ(), [0.5, 0, 0, 0, 0, 0])), 1.0, 2.0, True)
-    wait_until(lambda: twin.state()["arm_speed"] > 0.2)
-    assert not control.triggerProtectiveStop()
-    wait_until(lambda: twin.state()["arm_speed"] < 0.01)
-    assert twin.state()["safety_mode"] == "PROTECTIVE_STOP"
-
-
-def test_emergency_stop_takes_the_power_away(twin, control, receive):
-    twin.inject("emergency_stop")
-    wait_until(lambda: receive.isEmergencyStopped() and not control.isProgramRunning())
-    assert receive.getRobotMode() == 3
-    assert not control.servoJ(receive.getActualQ(), *SERVO)
-    twin.clear()
-    wait_until(lambda: not receive.isEmergencyStopped())
-    with_dashboard(twin, lambda dashboard: recover(twin, dashboard))
-    assert control.reuploadScript()
-    wait_until(control.isProgramRunning)
-
-
-def test_power_off(twin, control, receive):
-    twin.inject("power_off")
-    wait_until(lambda: receive.getRobotMode() == 3 and not control.isProgramRunning())  # told on two connections
-    assert not control.servoJ(receive.getActualQ(), *SERVO)
-    assert not receive.isEmergencyStopped()
-
-
-def test_program_stopped_on_the_pendant(twin, control, receive):
-    twin.inject("script_stop")
-    wait_until(lambda: not control.isProgramRunning())
-    assert not control.servoJ(receive.getActualQ(), *SERVO)
-    assert receive.getSafetyMode() == 1
-
-
-def test_local_control_refuses_a_new_client(twin):
-    twin.inject("remote_control_off")
-    with pytest.raises(RuntimeError, match="remote control"):
-        rtde_control.RTDEControlInterface(twin.address, RATE)
-
-
-def test_dashboard_gone(twin):
-    twin.inject("dashboard_gone")
-    with pytest.raises(RuntimeError, match="dashboard"):
-        dashboard_client.DashboardClient(twin.address).connect(500)
-    twin.clear()
-    with_dashboard(twin, lambda dashboard: dashboard.robotmode())
-
-
 def test_gripper_closes_and_opens(twin):
     with socket.create_connection((twin.address, ports.GRIPPER), timeout=5.0) as gripper:
 
@@ -333,47 +207,6 @@ def test_gripper_closes_and_opens(twin):
         assert twin.state()["joints"]["gripper"] == pytest.approx(1.0, abs=0.01)
         assert ask("SET POS 0") == "ack"
         wait_until(lambda: ask("GET POS") == "POS 3")
-
-
-def test_a_twin_tells_when_its_address_is_taken(twin):
-    with pytest.raises(TwinError, match="another twin"):
-        TwinProcess(address=twin.address).start()
-
-
-def test_nobody_there():
-    with pytest.raises(TwinError, match=r"python -m env_door\.twin"):
-        TwinClient(free_address()).state()
-
-
-def test_it_dies_with_its_parent():
-    address = free_address()
-    code = (
-        "import time; from env_door.twin import TwinProcess\n"
-        f"with TwinProcess(address={address!r}) as twin: print(twin.pid, flush=True); time.sleep(60)"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    pid = int(parent.stdout.readline())
-    os.kill(parent.pid, signal.SIGKILL)
-    parent.communicate()
-
-    def gone():
-        try:
-            with open(f"/proc/{pid}/stat") as stat:
-                return stat.read().split(") ")[1][0] == "Z"
-        except FileNotFoundError:
-            return True
-
-    wait_until(gone)
-
-
-@pytest.mark.parametrize(
-    ("flag", "says"), [("--kind=lift", "choose one of"), ("--door_offset=1", "0.05"), ("--speed=1", "--speed")]
-)
-def test_wrong_flags_are_explained(flag, says):
-    run = subprocess.run([sys.executable, "-m", "env_door.twin", flag], capture_output=True, text=True)
-    assert run.returncode != 0
-    assert says in run.stderr
-    assert "Traceback" not in run.stderr
 
 
 @pytest.mark.slow
@@ -395,3 +228,161 @@ def test_what_opens_the_door_in_the_environment_opens_it_through_the_client(twin
     state = twin.state()
     assert state["is_open"]
     assert state["attempts"] == [kind]
+
+
+# ── In trouble ────────────────────────────────────────────────────────
+
+
+def test_watchdog_stops_the_arm_when_the_client_falls_silent(twin, control, receive):
+    assert control.setWatchdog(2.0)
+    assert servo(control, receive, [0.1, 0, 0, 0, 0, 0], 0.5)
+    assert twin.state()["program"] == "PLAYING"
+    twin.wait_for(program="STOPPED", motion="hold")
+    wait_until(lambda: not control.isProgramRunning())
+    assert not control.kickWatchdog()
+    assert not control.servoJ(receive.getActualQ(), *SERVO)
+
+
+# What happens to the link is tested with a client that only listens. One that commands connects again by itself and
+# crashes now and then: only a process of its own may hold it when a link breaks, as that of the robot's servo does.
+def test_dropped_link_leaves_stale_values_and_can_be_made_again(twin, receive):
+    twin.inject("drop_link")
+    wait_until(lambda: not receive.isConnected())
+    stale = receive.getTimestamp()
+    time.sleep(0.05)
+    assert receive.getTimestamp() == stale
+    assert len(receive.getActualQ()) == 6
+    with pytest.raises(RuntimeError, match="verify the IP"):
+        rtde_receive.RTDEReceiveInterface(twin.address, RATE)
+    twin.clear("drop_link")
+    assert receive.reconnect()
+    assert receive.getTimestamp() > stale
+
+
+def test_frozen_link_stays_connected_while_nothing_comes_until_the_client_gives_up(twin, receive):
+    twin.inject("freeze")
+    time.sleep(0.05)
+    stale = receive.getTimestamp()
+    time.sleep(0.1)
+    assert receive.getTimestamp() == stale
+    assert receive.isConnected()
+    twin.clear()
+    wait_until(lambda: receive.getTimestamp() > stale)
+    twin.inject("freeze")
+    wait_until(lambda: not receive.isConnected())
+
+
+def test_delayed_measurements(twin, receive):
+    def lateness():
+        return twin.state()["controller_time"] - receive.getTimestamp()
+
+    assert lateness() < 0.15
+    twin.inject("delay", ms=400.0)
+    wait_until(lambda: lateness() > 0.35)
+    assert receive.isConnected()
+    twin.clear("delay")
+    wait_until(lambda: lateness() < 0.15)
+
+
+@pytest.mark.parametrize(
+    ("name", "robot_mode", "safety_mode", "safety_status"),
+    [
+        ("protective_stop", 7, 3, "PROTECTIVE_STOP"),
+        ("emergency_stop", 3, 7, "ROBOT_EMERGENCY_STOP"),
+        ("power_off", 3, 1, "NORMAL"),
+        ("script_stop", 7, 1, "NORMAL"),
+    ],
+)
+def test_what_ends_the_program_is_told_and_undone_by_hand(
+    twin, control, receive, dashboard, name, robot_mode, safety_mode, safety_status
+):
+    assert control.servoJ(receive.getActualQ(), *SERVO)
+    twin.inject(name)
+    # Told on two connections, one after the other.
+    wait_until(lambda: (receive.getRobotMode(), receive.getSafetyMode()) == (robot_mode, safety_mode))
+    wait_until(lambda: not control.isProgramRunning())
+    assert receive.isProtectiveStopped() == (name == "protective_stop")
+    assert receive.isEmergencyStopped() == (name == "emergency_stop")
+    assert dashboard.safetystatus() == f"Safetystatus: {safety_status}"
+    assert not control.servoJ(receive.getActualQ(), *SERVO)
+    twin.clear()
+    recover(twin, dashboard)
+    wait_until(lambda: (receive.getRobotMode(), receive.getSafetyMode()) == (7, 1))
+    assert goes_on_after_an_upload(control, receive)
+
+
+def test_a_client_ends_its_script_and_uploads_it_again(control, receive):
+    control.stopScript()
+    assert not control.isProgramRunning()
+    assert goes_on_after_an_upload(control, receive)
+
+
+def test_protective_stop_stops_the_moving_arm(twin, control, receive):
+    assert control.moveJ(list(np.add(receive.getActualQ(), [0.5, 0, 0, 0, 0, 0])), 1.0, 2.0, True)
+    wait_until(lambda: twin.state()["arm_speed"] > 0.2)
+    assert not control.triggerProtectiveStop()
+    wait_until(lambda: twin.state()["arm_speed"] < 0.01)
+    assert twin.state()["safety_mode"] == "PROTECTIVE_STOP"
+
+
+def test_local_control_refuses_a_new_client(twin):
+    twin.inject("remote_control_off")
+    with pytest.raises(RuntimeError, match="remote control"):
+        rtde_control.RTDEControlInterface(twin.address, RATE)
+
+
+def test_dashboard_gone(twin):
+    twin.inject("dashboard_gone")
+    with pytest.raises(RuntimeError, match="dashboard"):
+        dashboard_client.DashboardClient(twin.address).connect(500)
+
+
+# ── The process ───────────────────────────────────────────────────────
+
+
+def test_a_twin_tells_when_its_address_is_taken(running):
+    with pytest.raises(TwinError, match="another twin"):
+        TwinProcess(address=running.address).start()
+
+
+def test_nobody_there():
+    with pytest.raises(TwinError, match=r"python -m env_door\.twin"):
+        TwinClient(free_address()).state()
+
+
+def test_it_dies_with_its_parent():
+    code = (
+        "import time; from env_door.twin import TwinProcess\n"
+        f"with TwinProcess(address={free_address()!r}) as twin: print(twin.pid, flush=True); time.sleep(60)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    pid = int(parent.stdout.readline())
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.communicate()
+
+    def gone():
+        try:
+            with open(f"/proc/{pid}/stat") as stat:
+                return stat.read().split(") ")[1][0] == "Z"
+        except FileNotFoundError:
+            return True
+
+    wait_until(gone)
+
+
+@pytest.mark.parametrize(
+    ("flag", "says"),
+    [
+        ("--kind=lift", "one of ['push', 'pull', 'slide', 'random'], got 'lift'"),
+        ("--door_offset=1", "at most 0.05 m, got 1.0"),
+        ("--address=8.8.8.8", "choose an address of this machine"),
+        ("--speed=1", "--speed"),
+    ],
+)
+def test_wrong_flags_are_explained(flag, says):
+    run = subprocess.run(
+        [sys.executable, "-m", "env_door.twin", "--camera=false", flag], capture_output=True, text=True
+    )
+    assert run.returncode != 0
+    assert says in run.stderr
+    assert "Traceback" not in run.stderr

@@ -1,6 +1,7 @@
 import pytest
 
-from env_door.twin.gripper import Gripper, GripperSocket
+from env_door.twin import ports
+from env_door.twin.gripper import GripperModel
 
 STEP = 0.002
 
@@ -20,17 +21,9 @@ class Fingers:
         return self
 
 
-class Line:
-    def __init__(self):
-        self.sent = b""
-
-    def send(self, data):
-        self.sent += data
-
-
 @pytest.fixture
 def gripper():
-    made = Gripper()
+    made = GripperModel()
     made.switch_on(0.0)
     return made
 
@@ -105,37 +98,31 @@ def test_without_power_it_answers_with_question_marks_and_forgets_its_activation
 @pytest.mark.parametrize(
     ("request_line", "answer"),
     [
-        ("GET POS", b"POS 3\n"),
-        ("GET STA", b"STA 3\n"),
-        ("SET POS 200 SPE 255 FOR 1 GTO 1", b"ack"),
-        ("SET POS 256", b"?\n"),
-        ("SET XXX 1", b"?\n"),
-        ("SET POS", b"?\n"),
-        ("SET POS nan", b"?\n"),
-        ("hello", b"?\n"),
+        ("GET POS", "POS 3\n"),
+        ("GET STA", "STA 3\n"),
+        ("SET POS 200 SPE 255 FOR 1 GTO 1", "ack"),
+        ("SET POS 256", "?\n"),
+        ("SET XXX 1", "?\n"),
+        ("SET POS", "?\n"),
+        ("SET POS nan", "?\n"),
+        ("hello", "?\n"),
     ],
 )
-def test_socket(active, request_line, answer):
-    line = Line()
-    GripperSocket(line, active).received(request_line.encode() + b"\n")
-    assert line.sent == answer
+def test_requests_are_answered_as_by_the_urcap(active, request_line, answer):
+    assert active.answer(request_line) == answer
 
 
-def test_socket_takes_split_and_joined_lines(active):
-    line = Line()
-    socket = GripperSocket(line, active)
-    socket.received(b"GET P")
-    assert line.sent == b""
-    socket.received(b"OS\nGET STA\n")
-    assert line.sent == b"POS 3\nSTA 3\n"
-
-
-def test_silence_and_garbage(active):
-    line = Line()
-    active.silent = True
-    GripperSocket(line, active).received(b"GET POS\n")
-    assert line.sent == b""
-    active.silent, active.garbage = False, True
-    GripperSocket(line, active).received(b"GET POS\n")
-    assert line.sent
-    assert not line.sent.startswith(b"POS")
+def test_the_socket_takes_split_and_joined_lines_and_can_be_made_to_fail(twin, connect):
+    client = connect(ports.GRIPPER)
+    client.put(b"GET P")
+    client.turn()
+    assert client.take() == b""
+    client.put(b"OS\nGET STA\n")
+    client.turn()
+    assert client.take() == b"POS 3\nSTA 0\n"
+    twin.injections.start("gripper_garbage")
+    garbage = client.ask("GET POS")
+    assert garbage
+    assert not garbage.startswith("POS")
+    twin.injections.start("gripper_silent")
+    assert client.ask("GET POS") == ""

@@ -1,0 +1,69 @@
+"""Trials, requests, and what of it can be had without a simulator."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from env_door.env import DoorEnv
+
+
+@pytest.mark.parametrize("kind", ["push", "pull", "slide"])
+def test_trials_are_those_of_the_environment(twin, kind):
+    env = DoorEnv(kind=kind)
+    env.reset(seed=11)
+    state = twin.reset(kind=kind, seed=11)
+    np.testing.assert_array_equal(list(state["joints"].values()), env.measured_joints())
+    assert state["kind"] == kind
+    assert not state["attempts"]
+
+
+def test_a_new_trial_can_leave_the_arm_where_it_is(twin):
+    before = twin.state()["joints"]
+    assert twin.reset(seed=99, keep_arm=True)["joints"] == before
+    assert twin.reset(seed=99)["joints"] != before
+
+
+def test_somebody_holds_the_door_for_a_while(twin, requests):
+    assert requests.ask('{"do": "hold", "seconds": 0.1}') == '{"ok": true}\n'
+    assert twin.state()["held"]
+    requests.turn(50)
+    assert not twin.state()["held"]
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("nonsense", "Expecting value"),
+        ('{"do": "dance"}', "must be"),
+        ('{"do": "reset", "kind": "lift"}', "choose one of"),
+        ('{"do": "reset", "seed": -1}', "not negative"),
+        ('{"do": "hold", "seconds": -1}', "negative"),
+        ('{"do": "inject", "name": "rain"}', "drop_link"),
+        ('{"do": "inject", "name": "delay"}', "parameters are ['ms']"),
+        ('{"do": "inject", "name": "delay", "ms": -5}', "above 0"),
+        ('{"do": "inject", "name": "gripper_fault", "code": 16}', "1 to 15"),
+        ('{"do": "inject", "name": "camera_black"}', "no camera"),
+        ('{"do": "clear", "name": "script_stop"}', "uploads its script"),
+    ],
+)
+def test_a_request_is_told_what_is_wrong_with_it(requests, line, says):
+    answer = requests.ask(line)
+    assert '"ok": false' in answer
+    assert says in answer
+    assert '"injections": []' in requests.ask('{"do": "state"}')
+
+
+def test_the_client_needs_no_simulator():
+    # The package `env_door` itself is left out: what its first line imports is not the twin's.
+    code = (
+        "import importlib.util, sys, types\n"
+        "package = types.ModuleType('env_door')\n"
+        "package.__path__ = importlib.util.find_spec('env_door').submodule_search_locations\n"
+        "sys.modules['env_door'] = package\n"
+        "import env_door.twin, env_door.twin.ports\n"
+        "print(sorted({'mujoco', 'numpy', 'cv2', 'gymnasium'} & set(sys.modules)))\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.stdout == "[]\n", run.stderr
