@@ -63,14 +63,14 @@ class Client:
         self.socket.sendall(data)
         self.twin.turn(0)
 
-    def take(self):
-        answer, self.received = self.received, b""
-        return answer
-
     def ask(self, text):
         self.put(text.encode() + b"\n")
         self.turn(2)
-        return self.take().decode(errors="replace")
+        return self.take()
+
+    def take(self):
+        answer, self.received = self.received, b""
+        return answer.decode(errors="replace")
 
     def send(self, kind, body=b""):
         self.put(struct.pack(">HB", 3 + len(body), ord(kind)) + body)

@@ -9,7 +9,7 @@ from env_door.twin import ports
 def dashboard(connect):
     client = connect(ports.DASHBOARD)
     client.turn(2)
-    assert client.take() == b"Connected: Universal Robots Dashboard Server\n"
+    assert client.take() == "Connected: Universal Robots Dashboard Server\n"
     return client
 
 
@@ -56,7 +56,7 @@ def test_the_pendant_says_what_it_does_not_understand_and_says_goodbye(dashboard
     assert dashboard.ask("Dance!") == "could not understand: 'Dance!'\n"
     dashboard.put(b"quit\n")
     assert not dashboard.turn(2)
-    assert dashboard.take() == b"Disconnected\n"
+    assert dashboard.take() == "Disconnected\n"
 
 
 def test_a_blocked_arm_makes_a_protective_stop(twin):

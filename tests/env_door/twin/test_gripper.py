@@ -38,10 +38,9 @@ def active(gripper):
 def test_activation_takes_a_moment(gripper):
     assert gripper.get("STA") == "0"
     gripper.set({"ACT": 1})
-    fingers = Fingers(gripper).run(0.5)
-    assert gripper.get("STA") == "1"
-    fingers.run(0.6)
-    assert gripper.get("STA") == "3"
+    for seconds, status in ((0.5, "1"), (0.6, "3")):
+        Fingers(gripper).run(seconds)
+        assert gripper.get("STA") == status
 
 
 def test_it_does_not_move_before_it_is_activated(gripper):
@@ -112,14 +111,24 @@ def test_requests_are_answered_as_by_the_urcap(active, request_line, answer):
     assert active.answer(request_line) == answer
 
 
+def test_the_fingers_of_the_scene_close_and_open(twin, connect):
+    client = connect(ports.GRIPPER)
+    for request, reading, closure in (("GTO 1 SPE 255 FOR 200 POS 255", 230, 1.0), ("POS 0", 3, 0.0)):
+        assert client.ask(f"SET ACT 1 {request}") == "ack"
+        client.turn(1000)
+        assert client.ask("GET POS") == f"POS {reading}\n"
+        assert client.ask("GET OBJ") == "OBJ 3\n"
+        assert twin.state()["joints"]["gripper"] == pytest.approx(closure, abs=0.01)
+
+
 def test_the_socket_takes_split_and_joined_lines_and_can_be_made_to_fail(twin, connect):
     client = connect(ports.GRIPPER)
     client.put(b"GET P")
     client.turn()
-    assert client.take() == b""
+    assert client.take() == ""
     client.put(b"OS\nGET STA\n")
     client.turn()
-    assert client.take() == b"POS 3\nSTA 0\n"
+    assert client.take() == "POS 3\nSTA 0\n"
     twin.injections.start("gripper_garbage")
     garbage = client.ask("GET POS")
     assert garbage
