@@ -14,9 +14,9 @@ from env_door.twin.server import Twin
 class TurnedTwin(Twin):
     """Nothing happens to it but in `turn`."""
 
-    def __init__(self, config):
-        super().__init__(config)
-        self.address = config.address
+    def __init__(self):
+        self.address = free_address()
+        super().__init__(TwinConfig(address=self.address, kind="pull", seed=5, camera=False, unlock_seconds=1.0))
         self._loop = asyncio.new_event_loop()
         self._loop.run_until_complete(self.open())
 
@@ -47,6 +47,10 @@ class Client:
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.received = b""
 
+    def put(self, data):
+        self.socket.sendall(data)
+        self.twin.turn(0)
+
     def turn(self, ticks=1):
         """Whether the connection still stands after some ticks."""
         self.twin.turn(ticks)
@@ -56,26 +60,21 @@ class Client:
         except BlockingIOError:
             return True
         except ConnectionError:
-            return False
+            pass
         return False
-
-    def put(self, data):
-        self.socket.sendall(data)
-        self.twin.turn(0)
-
-    def ask(self, text):
-        self.put(text.encode() + b"\n")
-        self.turn(2)
-        return self.take()
 
     def take(self):
         answer, self.received = self.received, b""
         return answer.decode(errors="replace")
 
-    def send(self, kind, body=b""):
-        self.put(struct.pack(">HB", 3 + len(body), ord(kind)) + body)
+    def ask(self, text):
+        """Answer to a line of text."""
+        self.put(text.encode() + b"\n")
+        self.turn(2)
+        return self.take()
 
     def packages(self):
+        """The packages of RTDE that have come."""
         found = []
         while len(self.received) >= 3:
             size, kind = struct.unpack_from(">HB", self.received)
@@ -83,16 +82,14 @@ class Client:
             self.received = self.received[size:]
         return found
 
+    def send(self, kind, body=b""):
+        self.put(struct.pack(">HB", 3 + len(body), ord(kind)) + body)
+
     def exchange(self, kind, body=b""):
+        """Answer to a package of RTDE."""
         self.send(kind, body)
         self.turn(2)
         return next(answer for name, answer in self.packages() if name == kind)
-
-    def outputs(self, *names):
-        return self.exchange("O", struct.pack(">d", 125.0) + ",".join(names).encode())
-
-    def inputs(self, *names):
-        return self.exchange("I", ",".join(names).encode())
 
     def command(self, number, *values):
         """A command to the control script, through the first recipe of inputs."""
@@ -101,7 +98,7 @@ class Client:
 
 @pytest.fixture
 def twin():
-    made = TurnedTwin(TwinConfig(address=free_address(), kind="pull", seed=5, camera=False, unlock_seconds=1.0))
+    made = TurnedTwin()
     yield made
     made.close()
 
@@ -109,18 +106,6 @@ def twin():
 @pytest.fixture
 def connect(twin):
     return lambda port: Client(twin, port)
-
-
-@pytest.fixture
-def rtde(connect):
-    client = connect(ports.RTDE)
-    assert client.exchange("V", struct.pack(">H", 2)) == b"\x01"
-    return client
-
-
-@pytest.fixture
-def requests(connect):
-    return connect(ports.TWIN)
 
 
 @pytest.fixture

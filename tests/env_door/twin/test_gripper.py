@@ -66,24 +66,22 @@ def test_an_object_is_detected_and_squeezed(active):
     assert active.target == pytest.approx(1.0)
 
 
-def test_without_goto_it_stays(active):
+@pytest.mark.parametrize("stop", [lambda active: active.set({"GTO": 0}), lambda active: active.fail(14)])
+def test_without_goto_and_with_a_major_fault_it_stays(active, stop):
     active.set({"GTO": 1, "SPE": 255, "POS": 255})
     fingers = Fingers(active).run(0.2)
-    active.set({"GTO": 0})
-    assert fingers.closure == pytest.approx(fingers.run(0.5).closure, abs=0.01)
-
-
-def test_a_major_fault_stops_it_until_it_is_activated_again(active):
-    active.set({"GTO": 1, "SPE": 255, "POS": 255})
-    fingers = Fingers(active).run(0.2)
-    active.fail(14)
+    stop(active)
     stopped_at = fingers.closure
     assert fingers.run(0.5).closure == pytest.approx(stopped_at, abs=0.01)
+
+
+def test_a_major_fault_lasts_until_it_is_activated_again(active):
+    active.fail(14)
     active.fail(0)
     assert active.get("FLT") == "14"
     active.set({"ACT": 0})
     active.set({"ACT": 1})
-    fingers.run(1.1)
+    Fingers(active).run(1.1)
     assert (active.get("FLT"), active.get("STA")) == ("0", "3")
 
 

@@ -8,43 +8,51 @@ import pytest
 from env_door.env import DoorEnv
 from env_door.twin import ports
 
-INPUTS = ["input_int_register_0", "input_double_register_0"]
+
+@pytest.fixture
+def rtde(connect):
+    return connect(ports.RTDE)
 
 
-def test_other_protocol_versions_are_refused(connect):
-    assert connect(ports.RTDE).exchange("V", struct.pack(">H", 1)) == b"\x00"
+def ask_for(rtde, names):
+    return rtde.exchange("O", struct.pack(">d", 125.0) + names)
+
+
+def test_only_the_second_version_of_the_protocol_is_spoken(rtde):
+    assert [rtde.exchange("V", struct.pack(">H", version)) for version in (1, 2)] == [b"\x00", b"\x01"]
 
 
 def test_measurements_are_those_of_the_scene_at_the_rate_asked_for(rtde):
     env = DoorEnv(kind="pull")
     env.reset(seed=5)
-    assert rtde.outputs("timestamp", "actual_q", "runtime_state") == b"\x01DOUBLE,VECTOR6D,UINT32"
+    assert ask_for(rtde, b"timestamp,actual_q,runtime_state") == b"\x01DOUBLE,VECTOR6D,UINT32"
     assert rtde.exchange("S") == b"\x01"
     rtde.packages()
     rtde.turn(40)
-    packages = [struct.unpack(">B7dI", body) for kind, body in rtde.packages() if kind == "U"]
+    packages = np.array([struct.unpack(">B7dI", body) for kind, body in rtde.packages() if kind == "U"])
     assert len(packages) == 10
-    np.testing.assert_allclose(np.diff([package[1] for package in packages]), 0.008, atol=1e-9)
-    np.testing.assert_allclose(packages[-1][2:8], env.measured_joints()[:6], atol=1e-3)
-    assert packages[-1][8] == 1
+    np.testing.assert_allclose(np.diff(packages[:, 1]), 0.008, atol=1e-9)
+    np.testing.assert_allclose(packages[-1, 2:8], env.measured_joints()[:6], atol=1e-3)
+    assert packages[-1, 8] == 1
     assert rtde.exchange("P") == b"\x01"
     rtde.turn(20)
     assert not rtde.packages()
 
 
 def test_an_unknown_variable_is_named_and_nothing_starts(rtde):
-    assert rtde.outputs("timestamp", "nonsense") == b"\x00DOUBLE,NOT_FOUND"
+    assert ask_for(rtde, b"timestamp,nonsense") == b"\x00DOUBLE,NOT_FOUND"
     assert rtde.exchange("S") == b"\x00"
 
 
 def test_inputs_belong_to_one_client_until_it_leaves(connect, rtde):
-    assert rtde.inputs(*INPUTS) == b"\x01INT32,DOUBLE"
-    assert rtde.inputs(INPUTS[0]) == b"\x02INT32"
+    names = b"input_int_register_0,input_double_register_0"
+    assert rtde.exchange("I", names) == b"\x01INT32,DOUBLE"
+    assert rtde.exchange("I", b"input_int_register_0") == b"\x02INT32"
     other = connect(ports.RTDE)
-    assert other.inputs(*INPUTS, "output_int_register_0") == b"\x00IN_USE,IN_USE,NOT_FOUND"
+    assert other.exchange("I", names + b",output_int_register_0") == b"\x00IN_USE,IN_USE,NOT_FOUND"
     rtde.socket.close()
     other.turn(2)
-    assert other.inputs(*INPUTS) == b"\x01INT32,DOUBLE"
+    assert other.exchange("I", names) == b"\x01INT32,DOUBLE"
 
 
 @pytest.mark.parametrize(
@@ -53,15 +61,7 @@ def test_inputs_belong_to_one_client_until_it_leaves(connect, rtde):
     ids=["short header", "empty", "unknown recipe", "short data", "short recipe", "no text"],
 )
 def test_malformed_packages_end_the_connection_and_nothing_else(connect, rtde, package):
-    rtde.inputs(*INPUTS)
+    rtde.exchange("I", b"input_int_register_0")
     rtde.put(package)
     assert not rtde.turn(3)
     assert connect(ports.RTDE).exchange("V", struct.pack(">H", 2)) == b"\x01"
-
-
-def test_packages_may_come_in_pieces_and_together(rtde):
-    rtde.put(b"\x00\x05")
-    assert not rtde.received
-    rtde.put(b"V\x00\x02" + b"\x00\x03v")
-    rtde.turn()
-    assert [kind for kind, _ in rtde.packages()] == ["V", "v"]
