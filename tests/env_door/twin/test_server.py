@@ -44,7 +44,7 @@ def test_somebody_holds_the_door_for_a_while(twin, requests):
     [
         ("nonsense", "Expecting value"),
         ('{"do": "dance"}', "must be"),
-        ('{"do": "reset", "kind": "lift"}', "choose one of"),
+        ('{"do": "reset", "kind": "lift"}', "'slide', 'random'"),
         ('{"do": "reset", "seed": -1}', "not negative"),
         ('{"do": "hold", "seconds": -1}', "negative"),
         ('{"do": "inject", "name": "rain"}', "drop_link"),
