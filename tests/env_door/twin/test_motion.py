@@ -77,7 +77,7 @@ def test_a_move_to_where_it_is_ends_at_once():
 
 def test_stop_brakes_within_the_distance_of_constant_deceleration():
     made = motion()
-    made.speed(np.full(6, 1.0), 10.0)
+    made.move(np.full(6, 5.0), 1.0, 10.0)
     before = run(made, 0.5)[-1]
     made.stop(2.0)
     after = run(made, 1.0)[-1]

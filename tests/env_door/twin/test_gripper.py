@@ -1,6 +1,7 @@
 import pytest
 
-from env_door.twin.gripper import Gripper, GripperSocket
+from env_door.twin import ports
+from env_door.twin.gripper import GripperModel
 
 STEP = 0.002
 
@@ -20,17 +21,9 @@ class Fingers:
         return self
 
 
-class Line:
-    def __init__(self):
-        self.sent = b""
-
-    def send(self, data):
-        self.sent += data
-
-
 @pytest.fixture
 def gripper():
-    made = Gripper()
+    made = GripperModel()
     made.switch_on(0.0)
     return made
 
@@ -45,10 +38,9 @@ def active(gripper):
 def test_activation_takes_a_moment(gripper):
     assert gripper.get("STA") == "0"
     gripper.set({"ACT": 1})
-    fingers = Fingers(gripper).run(0.5)
-    assert gripper.get("STA") == "1"
-    fingers.run(0.6)
-    assert gripper.get("STA") == "3"
+    for seconds, status in ((0.5, "1"), (0.6, "3")):
+        Fingers(gripper).run(seconds)
+        assert gripper.get("STA") == status
 
 
 def test_it_does_not_move_before_it_is_activated(gripper):
@@ -74,24 +66,22 @@ def test_an_object_is_detected_and_squeezed(active):
     assert active.target == pytest.approx(1.0)
 
 
-def test_without_goto_it_stays(active):
+@pytest.mark.parametrize("stop", [lambda active: active.set({"GTO": 0}), lambda active: active.fail(14)])
+def test_without_goto_and_with_a_major_fault_it_stays(active, stop):
     active.set({"GTO": 1, "SPE": 255, "POS": 255})
     fingers = Fingers(active).run(0.2)
-    active.set({"GTO": 0})
-    assert fingers.closure == pytest.approx(fingers.run(0.5).closure, abs=0.01)
-
-
-def test_a_major_fault_stops_it_until_it_is_activated_again(active):
-    active.set({"GTO": 1, "SPE": 255, "POS": 255})
-    fingers = Fingers(active).run(0.2)
-    active.fail(14)
+    stop(active)
     stopped_at = fingers.closure
     assert fingers.run(0.5).closure == pytest.approx(stopped_at, abs=0.01)
+
+
+def test_a_major_fault_lasts_until_it_is_activated_again(active):
+    active.fail(14)
     active.fail(0)
     assert active.get("FLT") == "14"
     active.set({"ACT": 0})
     active.set({"ACT": 1})
-    fingers.run(1.1)
+    Fingers(active).run(1.1)
     assert (active.get("FLT"), active.get("STA")) == ("0", "3")
 
 
@@ -105,37 +95,41 @@ def test_without_power_it_answers_with_question_marks_and_forgets_its_activation
 @pytest.mark.parametrize(
     ("request_line", "answer"),
     [
-        ("GET POS", b"POS 3\n"),
-        ("GET STA", b"STA 3\n"),
-        ("SET POS 200 SPE 255 FOR 1 GTO 1", b"ack"),
-        ("SET POS 256", b"?\n"),
-        ("SET XXX 1", b"?\n"),
-        ("SET POS", b"?\n"),
-        ("SET POS nan", b"?\n"),
-        ("hello", b"?\n"),
+        ("GET POS", "POS 3\n"),
+        ("GET STA", "STA 3\n"),
+        ("SET POS 200 SPE 255 FOR 1 GTO 1", "ack"),
+        ("SET POS 256", "?\n"),
+        ("SET XXX 1", "?\n"),
+        ("SET POS", "?\n"),
+        ("SET POS nan", "?\n"),
+        ("hello", "?\n"),
     ],
 )
-def test_socket(active, request_line, answer):
-    line = Line()
-    GripperSocket(line, active).received(request_line.encode() + b"\n")
-    assert line.sent == answer
+def test_requests_are_answered_as_by_the_urcap(active, request_line, answer):
+    assert active.answer(request_line) == answer
 
 
-def test_socket_takes_split_and_joined_lines(active):
-    line = Line()
-    socket = GripperSocket(line, active)
-    socket.received(b"GET P")
-    assert line.sent == b""
-    socket.received(b"OS\nGET STA\n")
-    assert line.sent == b"POS 3\nSTA 3\n"
+def test_the_fingers_of_the_scene_close_and_open(twin, connect):
+    client = connect(ports.GRIPPER)
+    for request, reading, closure in (("GTO 1 SPE 255 FOR 200 POS 255", 230, 1.0), ("POS 0", 3, 0.0)):
+        assert client.ask(f"SET ACT 1 {request}") == "ack"
+        client.turn(1000)
+        assert client.ask("GET POS") == f"POS {reading}\n"
+        assert client.ask("GET OBJ") == "OBJ 3\n"
+        assert twin.state()["joints"]["gripper"] == pytest.approx(closure, abs=0.01)
 
 
-def test_silence_and_garbage(active):
-    line = Line()
-    active.silent = True
-    GripperSocket(line, active).received(b"GET POS\n")
-    assert line.sent == b""
-    active.silent, active.garbage = False, True
-    GripperSocket(line, active).received(b"GET POS\n")
-    assert line.sent
-    assert not line.sent.startswith(b"POS")
+def test_the_socket_takes_split_and_joined_lines_and_can_be_made_to_fail(twin, connect):
+    client = connect(ports.GRIPPER)
+    client.put(b"GET P")
+    client.turn()
+    assert client.take() == ""
+    client.put(b"OS\nGET STA\n")
+    client.turn()
+    assert client.take() == "POS 3\nSTA 0\n"
+    twin.injections.start("gripper_garbage")
+    garbage = client.ask("GET POS")
+    assert garbage
+    assert not garbage.startswith("POS")
+    twin.injections.start("gripper_silent")
+    assert client.ask("GET POS") == ""
