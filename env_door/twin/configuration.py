@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from env_door.checks import check_choice, check_range
-from env_door.env import MAX_HOLD, MAX_OFFSET
 from env_door.latch import KINDS
+from env_door.limits import MAX_HOLD, MAX_OFFSET
 
 
 @dataclass(frozen=True)
