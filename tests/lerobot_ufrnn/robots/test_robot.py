@@ -12,7 +12,7 @@ pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
 from env_door.env import DoorEnv
 from env_door.twin import TwinProcess
 from lerobot_ufrnn.robots.ur5e_robotiq import Fault, RobotFaultError, UR5eRobotiq, UR5eRobotiqConfig
-from lerobot_ufrnn.robots.ur5e_robotiq import ur5e_robotiq as robot_module
+from lerobot_ufrnn.robots.ur5e_robotiq import robot as robot_module
 
 pytestmark = pytest.mark.real_time
 

@@ -1,0 +1,173 @@
+"""LeRobot's own commands, unchanged, with an operator whose events are played."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import teleoperators_fakes as fakes
+from lerobot.configs.dataset import DatasetRecordConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.robots import Robot, RobotConfig
+from lerobot.scripts import lerobot_record, lerobot_teleoperate
+from lerobot.utils.constants import ACTION, OBS_STATE
+from scipy.spatial.transform import Rotation
+
+from env_door.scene import UR5E
+from lerobot_ufrnn.teleoperators import SpaceMouseTwistConfig, twist_teleoperator
+
+STEPS, PERIOD = 40, 0.1
+
+
+def write(path, events):
+    path.write_text("".join(json.dumps(event) + "\n" for event in events))
+    return path
+
+
+class FakeUR5e(Robot):
+    """Has the features of the real one and is always where it was sent; each observation lets a period pass."""
+
+    config_class = RobotConfig
+    name = "fake_ur5e"
+    observation_features = action_features = dict.fromkeys(fakes.FEATURES, float)
+    is_connected, is_calibrated = False, True
+    cameras: dict = {}  # noqa: RUF012
+
+    def __init__(self, world, folder):
+        self.world, self.robot_type, self.id, self.calibration_dir = world, self.name, None, folder
+
+    def calibrate(self):
+        pass
+
+    configure = calibrate
+
+    def connect(self, calibrate=True):
+        self.is_connected = True
+        self.world.order.append("robot connected")
+
+    def disconnect(self):
+        self.is_connected = False
+        self.world.order.append("robot disconnected")
+
+    def get_observation(self):
+        self.world.clock.now += PERIOD
+        return dict(zip(fakes.FEATURES, (*self.world.arm.measured, self.world.arm.gripper), strict=True))
+
+    def send_action(self, action):
+        target = np.array([action[name] for name in fakes.FEATURES])
+        self.world.actions.append(target)
+        self.world.leads.append(np.abs(target[:6] - self.world.arm.measured).max())
+        self.world.arm.measured, self.world.arm.gripper = target[:6], target[6]
+        if len(self.world.actions) == STEPS:
+            self.world.controls.update(exit_early=True)
+        return action
+
+
+@RobotConfig.register_subclass("fake_ur5e")
+class FakeUR5eConfig(RobotConfig):
+    """Nothing to configure."""
+
+
+@pytest.fixture
+def world(monkeypatch, tmp_path):
+    """The fake arm, and what happens to it."""
+    world = SimpleNamespace(arm=fakes.FakeArmState(), clock=fakes.Clock(), actions=[], leads=[], order=[])
+    world.controls = {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
+
+    def connect_arm(*_):
+        world.order.append("teleoperator connected")
+        return world.arm
+
+    monkeypatch.setattr(twist_teleoperator, "ArmState", connect_arm)
+    monkeypatch.setattr(twist_teleoperator, "monotonic", world.clock)
+    monkeypatch.setattr(lerobot_record, "init_keyboard_listener", lambda: (None, world.controls))
+    monkeypatch.setattr(lerobot_record, "make_robot_from_config", lambda _: FakeUR5e(world, tmp_path))
+    return world
+
+
+def test_lerobot_record_writes_what_the_robot_was_sent(world, tmp_path):
+    # Changes lie between the periods: each state lasts for a whole number of them.
+    events = [
+        {"time": 0.0, "twist": [0, 0, 0, 0, 0, 0]},
+        {"time": 0.05, "twist": [0, 0, 0.5, 0, 0, 0]},
+        {"time": 1.05, "twist": [0, 0, 0, 0.6, 0, 0]},
+        {"time": 2.05, "twist": [0, 0, 0, 0, 0, 0], "buttons": ["close"]},
+        {"time": 2.55, "twist": [0, 0, 0, 0, 0, 0]},
+    ]
+    device = write(tmp_path / "events.jsonl", events)
+    lerobot_record.record(
+        lerobot_record.RecordConfig(
+            robot=FakeUR5eConfig(),
+            teleop=SpaceMouseTwistConfig(robot_ip="192.0.2.1", device=device, calibration_dir=tmp_path),
+            dataset=DatasetRecordConfig(
+                repo_id="me/rehearsal",
+                single_task="open the door",
+                root=tmp_path / "dataset",
+                fps=200,
+                episode_time_s=120,
+                num_episodes=1,
+                push_to_hub=False,
+            ),
+            play_sounds=False,
+        )
+    )
+    # The order is LeRobot's: it is why the teleoperator must not look where the arm is before the first action.
+    assert world.order == ["teleoperator connected", "robot connected", "robot disconnected"]
+    assert not world.arm.is_open
+    actions = np.array(world.actions)
+    np.testing.assert_array_equal(actions[0], [*fakes.READY, 0.0])
+    start, start_rotation = fakes.tool_pose(fakes.READY)
+    position, rotation = fakes.tool_pose(actions[-1, :6])
+    np.testing.assert_allclose(position - start, [0, 0, 1.0 * 0.5 * 0.1], atol=5e-5)
+    turned = (rotation * start_rotation.inv()) * Rotation.from_rotvec([1.0 * 0.6 * 0.5, 0, 0]).inv()
+    assert turned.magnitude() < 5e-4
+    assert actions[-1, 6] == pytest.approx(0.5)
+    assert max(world.leads) <= 0.07
+    assert np.abs(np.diff(actions[:, :6], axis=0)).max() <= 0.6 * PERIOD + 1e-9
+
+    dataset = LeRobotDataset("me/rehearsal", root=tmp_path / "dataset")
+    assert dataset.features[ACTION]["names"] == dataset.features[OBS_STATE]["names"] == fakes.FEATURES
+    assert [f"{joint}.pos" for joint in (*UR5E.joints, "gripper")] == fakes.FEATURES
+    recorded = np.array(dataset.hf_dataset.with_format("numpy")[ACTION])
+    np.testing.assert_allclose(recorded, actions, atol=1e-6)
+
+
+def test_lerobot_teleoperate_moves_the_twin_along_and_nothing_else(tmp_path, monkeypatch):
+    """The real client of the controller, the robot and its twin: nothing stands in for anything here."""
+    pytest.importorskip("rtde_control", reason="needs the extra `ur5e`")
+    from env_door.twin import TwinProcess, free_address
+
+    events = [
+        {"time": 0.0, "twist": [0, 0, 0, 0, 0, 0]},
+        {"time": 0.5, "twist": [-0.6, 0, 0, 0, 0, 0]},
+        {"time": 1.3, "twist": [0, 0, 0.6, 0, 0, 0], "buttons": ["close"]},
+        {"time": 2.1, "twist": [0, 0, 0, 0, 0, 0]},
+    ]
+    with TwinProcess(address=free_address(), kind="push", seed=3) as twin:
+        before = twin.state()["joints"]
+        flags = [
+            "--robot.type=ur5e_robotiq",
+            f"--robot.ip={twin.address}",
+            f"--robot.calibration_dir={tmp_path}",
+            "--teleop.type=spacemouse_twist",
+            f"--teleop.robot_ip={twin.address}",
+            f"--teleop.device={write(tmp_path / 'events.jsonl', events)}",
+            f"--teleop.calibration_dir={tmp_path}",
+            "--fps=10",
+            "--teleop_time_s=3",
+        ]
+        monkeypatch.setattr(sys, "argv", ["lerobot-teleoperate", *flags])
+        lerobot_teleoperate.teleoperate()
+        after = twin.state()["joints"]
+    (start, start_rotation), (position, rotation) = (
+        fakes.tool_pose([joints[name] for name in fakes.JOINTS]) for joints in (before, after)
+    )
+    # How far depends on how evenly the loop ran; the way does not.
+    back, aside, up = position - start
+    assert -0.06 < back < -0.02
+    assert 0.02 < up < 0.06
+    assert abs(aside) < 0.002
+    assert (rotation * start_rotation.inv()).magnitude() < 0.01
+    assert before["gripper"] < 0.05
+    assert after["gripper"] > 0.4
