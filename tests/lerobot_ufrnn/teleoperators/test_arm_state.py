@@ -1,37 +1,88 @@
-"""Against the real client of `ur_rtde`, with the smallest controller that satisfies it."""
+"""Where the arm is, asked of the digital twin by the real client of `ur_rtde`, and of sockets that talk nonsense."""
 
-import multiprocessing
 import socket
 import threading
-import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import teleoperators_fakes as fakes
-from teleoperators_controller import ADDRESS, CLOSED, ONE_PACKAGE, RUNNING, SILENT, run_controller
 from waiting import wait_until
 
-from lerobot_ufrnn.teleoperators import ArmStateError, SpaceMouseTwistConfig
-from lerobot_ufrnn.teleoperators.arm_state import ArmState
+from lerobot_ufrnn.teleoperators import ArmStateError, SpaceMouseTwistConfig, arm_state
+from lerobot_ufrnn.teleoperators.arm_state import RTDE_PORT, ArmState
 
 
-def make_arm(address=ADDRESS, clock=time.monotonic, **settings):
-    return ArmState(SpaceMouseTwistConfig(robot_ip=address, **settings), clock)
+def make_arm(address, **settings):
+    return ArmState(SpaceMouseTwistConfig(robot_ip=address, **settings))
 
 
 @pytest.fixture
-def controller():
-    """`joints` to be told, and `mode`. In a process of its own: the client holds the GIL while it connects."""
+def twin():
     pytest.importorskip("rtde_receive", reason="needs the extra `ur5e`")
-    context = multiprocessing.get_context("spawn")
-    joints, mode = context.Array("d", fakes.READY.tolist(), lock=False), context.Value("i", RUNNING)
-    ready = context.Event()
-    process = context.Process(target=run_controller, args=(joints, mode, ready), daemon=True)
-    process.start()
-    assert ready.wait(30)
-    yield joints, mode
-    process.kill()
-    process.join()
+    from env_door.twin import TwinProcess, free_address
+
+    with TwinProcess(address=free_address(), kind="push", seed=3) as twin:
+        yield twin
+
+
+@pytest.fixture
+def arm(twin):
+    arm = make_arm(twin.address)
+    arm.open()
+    yield arm
+    arm.close()
+    arm.close()
+
+
+@pytest.mark.real_time
+def test_joints_are_the_controllers_and_follow_it(twin, arm):
+    def agree():
+        state = twin.state()["joints"]
+        return np.allclose(arm.joints(), [state[name] for name in fakes.JOINTS], atol=1e-3)
+
+    wait_until(agree)
+    before = arm.joints()
+    twin.reset("push", 4)
+    wait_until(lambda: agree() and np.abs(arm.joints() - before).max() > 0.01)
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize(
+    ("injection", "told"), [("freeze", r"has sent nothing for 0\.|broke"), ("drop_link", "start the command again")]
+)
+def test_a_controller_that_falls_silent_or_away_is_told_although_the_client_goes_on_answering(
+    twin, arm, injection, told
+):
+    arm.joints()
+    twin.fault(injection)
+    with pytest.raises(ArmStateError, match=told):
+        wait_until(lambda: arm.joints() is None, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("joints", "later", "told"),
+    [([0.0] * 6, 30.0, r"has sent nothing for 30\.0 s"), ([0.0] * 5, 0.1, "instead of six")],
+)
+def test_silence_before_the_first_look_and_nonsense_are_told_too(monkeypatch, joints, later, told):
+    client = SimpleNamespace(
+        getTimestamp=lambda: 1.0, getActualQ=lambda: joints, isConnected=lambda: True, disconnect=lambda: None
+    )
+    library = SimpleNamespace(RTDEReceiveInterface=lambda *_: client)
+    monkeypatch.setattr(arm_state, "import_client", lambda _: (None, library, None))
+    clock = fakes.Clock()
+    with socket.create_server(("127.0.0.9", RTDE_PORT)):
+        arm = ArmState(SpaceMouseTwistConfig(robot_ip="127.0.0.9"), clock)
+        arm.open()
+    clock.now += later
+    with pytest.raises(ArmStateError, match=told):
+        arm.joints()
+
+
+def test_without_a_controller_it_says_which_flag_to_look_at():
+    pytest.importorskip("rtde_receive", reason="needs the extra `ur5e`")
+    with pytest.raises(ArmStateError, match=r"127\.0\.0\.10:30004.*--teleop\.robot_ip"):
+        make_arm("127.0.0.10").open()
 
 
 def answer_gripper(answer):
@@ -47,56 +98,6 @@ def answer_gripper(answer):
 
     threading.Thread(target=serve, daemon=True).start()
     return server.getsockname()[1]
-
-
-@pytest.fixture
-def arm(controller):
-    """The arm of that controller, told of its joints."""
-    arm = make_arm()
-    arm.open()
-    yield arm
-    arm.close()
-    arm.close()
-
-
-def test_joints_are_the_controllers_and_follow_it(controller, arm):
-    joints, _ = controller
-    wait_until(lambda: np.array_equal(arm.joints(), fakes.READY))
-    joints[2] = 1.25
-    wait_until(lambda: arm.joints()[2] == 1.25)
-
-
-@pytest.mark.parametrize(
-    ("mode_after", "told"), [(SILENT, r"has sent nothing for 0\.|broke"), (CLOSED, "start the command again")]
-)
-def test_a_controller_that_falls_silent_or_away_is_told_although_the_client_goes_on_answering(
-    controller, arm, mode_after, told
-):
-    _, mode = controller
-    wait_until(lambda: np.array_equal(arm.joints(), fakes.READY))
-    mode.value = mode_after
-    with pytest.raises(ArmStateError, match=told):
-        wait_until(lambda: arm.joints() is None, 3.0)
-
-
-def test_silence_before_the_first_look_is_told_too(controller):
-    _, mode = controller
-    clock = fakes.Clock()
-    arm = make_arm(clock=clock)
-    mode.value = ONE_PACKAGE
-    arm.open()
-    try:
-        clock.now += 30.0
-        with pytest.raises(ArmStateError, match=r"has sent nothing for 30\.0 s"):
-            arm.joints()
-    finally:
-        arm.close()
-
-
-def test_without_a_controller_it_says_which_flag_to_look_at():
-    pytest.importorskip("rtde_receive", reason="needs the extra `ur5e`")
-    with pytest.raises(ArmStateError, match=r"127\.0\.0\.10:30004.*--teleop\.robot_ip"):
-        make_arm("127.0.0.10").open()
 
 
 @pytest.mark.parametrize(("reading", "closure"), [(3, 0.0), (0, 0.0), (230, 1.0), (255, 1.0), (117, 114 / 227)])

@@ -1,4 +1,3 @@
-import logging
 import sys
 from types import SimpleNamespace
 
@@ -91,13 +90,6 @@ def test_keys_count_while_they_are_held_and_only_with_shift(device):
     assert twist() == [0, 1]
     listener.release(SHIFT)
     assert twist() == [0, 0]
-
-
-def test_keys_are_explained_when_it_opens(desktop, caplog):
-    with caplog.at_level(logging.INFO):
-        KeyboardDevice().open()
-    assert "w/s ahead/back" in caplog.text
-    assert "Hold Shift" in caplog.text
 
 
 def test_a_listener_that_ends_is_told(device):
