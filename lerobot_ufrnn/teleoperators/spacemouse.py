@@ -31,12 +31,6 @@ class SpaceMouseDevice(TwistDevice):
 
     A thread reads all reports as they come: the kernel keeps only 64 and then drops the newest, so that after a pause
     a reader would take an old deflection for the present one.
-
-    Args:
-        config (`SpaceMouseTwistConfig`):
-            Dead zone, and for how long a report counts.
-        clock (`Callable[[], float]`, *optional*, defaults to `time.monotonic`):
-            Time in seconds.
     """
 
     def __init__(self, config: SpaceMouseTwistConfig, clock: Callable[[], float] = time.monotonic):

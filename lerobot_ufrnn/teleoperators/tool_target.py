@@ -39,12 +39,7 @@ class Hindrance(Enum):
 
 
 class ToolTarget:
-    """Where the tool is to be, and the joint targets for it.
-
-    Args:
-        config (`TwistTeleoperatorConfig`):
-            Limits: `joint_speed`, `max_lead` and `min_manipulability`.
-    """
+    """Where the tool is to be, and the joint targets for it."""
 
     def __init__(self, config: TwistTeleoperatorConfig):
         self._joint_speed = config.joint_speed

@@ -44,14 +44,12 @@ class TwistTeleoperator(Teleoperator):
     1, closed. So the stock `lerobot-teleoperate` and `lerobot-record` need no processors, and what they record is
     what a policy of the simulated door is trained on.
 
-    **Where it starts.** The stock loops call `get_action()` without saying where the arm is, and call `send_feedback`
-    for one humanoid only; they connect the teleoperator before the robot. A pose from the configuration would be a
-    guess, and a wrong guess a jump. So the teleoperator asks the arm's controller itself, through a connection of its
-    own that can only read, and it does so when the *first action* is asked for, when the robot is connected and
-    at rest. That first action is the measured pose itself, whatever the device says, with the gripper's target in
-    force. The connection stays open: every later target lies within `max_lead` of the joints measured at that moment,
-    so that there cannot be a jump later either, be the arm blocked or moved by somebody else. After a pause of more
-    than a second, such as LeRobot makes to save an episode, it starts anew from where the arm is.
+    **Where it starts.** The stock loops connect the teleoperator before the robot and never tell it where the arm is; a
+    pose from the configuration would be a guess, and a wrong guess a jump. So it asks the arm's controller itself,
+    through a connection of its own that can only read, when the *first action* is asked for: that is the measured pose,
+    whatever the device says, with the gripper's target in force. Every later target lies within `max_lead` of the
+    joints measured at that moment, be the arm blocked or moved by somebody else. After a pause of more than a second,
+    such as LeRobot makes to save an episode, it starts anew from where the arm is.
 
     **When something is wrong.** A device that is silent or gives nonsense counts as at rest: the arm holds. A device
     that is gone, or an arm whose place is not known any more, ends `get_action()` with an error that says what to do;

@@ -40,10 +40,6 @@ class RobotiqGripper:
     """Follows a target and knows where it is; a thread of its own does the asking.
 
     The socket takes tens of milliseconds to answer, too long for a control loop to wait for.
-
-    Args:
-        config (`UR5eRobotiqConfig`):
-            Address, force, speed and range.
     """
 
     def __init__(self, config: UR5eRobotiqConfig):

@@ -38,10 +38,6 @@ class Limits:
 
     A target is limited, in this order, to the joint ranges, to the joint speed, to a distance from the measured joints
     and to the workspace. What is no target at all (a wrong number of values, a value that is not finite) is refused.
-
-    Args:
-        config (`UR5eRobotiqConfig`):
-            The limits.
     """
 
     def __init__(self, config: UR5eRobotiqConfig):

@@ -106,12 +106,7 @@ class _Shared:
 
 
 class Servo:
-    """The servo process as its owner sees it.
-
-    Args:
-        config (`UR5eRobotiqConfig`):
-            Address, rates and limits.
-    """
+    """The servo process as its owner sees it."""
 
     def __init__(self, config: UR5eRobotiqConfig):
         self._config = config

@@ -9,7 +9,7 @@ from lerobot.robots import make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from waiting import wait_until
 
-pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
+dashboard_client = pytest.importorskip("dashboard_client", reason="ur_rtde is not installed")
 
 from env_door.env import DoorEnv
 from env_door.twin import TwinProcess
@@ -208,6 +208,10 @@ def test_after_the_operator_has_looked_it_connects_again(twin, connected):
         robot.connect()
     assert not robot.is_connected
     twin.clear()
+    pendant = dashboard_client.DashboardClient(twin.address)
+    pendant.connect()
+    pendant.unlockProtectiveStop()
+    pendant.disconnect()
     robot.connect()
     move(robot, TURN, 1)
 
