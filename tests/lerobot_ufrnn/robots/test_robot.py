@@ -1,5 +1,6 @@
 """The robot on the digital twin, through the real client library: what it does, and what it does when it fails."""
 
+import importlib
 import sys
 import time
 
@@ -9,7 +10,7 @@ from lerobot.robots import make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from waiting import wait_until
 
-dashboard_client = pytest.importorskip("dashboard_client", reason="ur_rtde is not installed")
+pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
 
 from env_door.env import DoorEnv
 from env_door.twin import TwinProcess
@@ -208,7 +209,7 @@ def test_after_the_operator_has_looked_it_connects_again(twin, connected):
         robot.connect()
     assert not robot.is_connected
     twin.clear()
-    pendant = dashboard_client.DashboardClient(twin.address)
+    pendant = importlib.import_module("dashboard_client").DashboardClient(twin.address)
     pendant.connect()
     pendant.unlockProtectiveStop()
     pendant.disconnect()

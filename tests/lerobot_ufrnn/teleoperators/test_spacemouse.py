@@ -15,18 +15,24 @@ def make_device(clock=time.monotonic, **settings):
     return SpaceMouseDevice(SpaceMouseTwistConfig(robot_ip="192.0.2.1", **settings), clock)
 
 
-class FakeMouse:
-    """What `pyspacemouse.open` returns; `report` is what it read last."""
+def report(t, twist=(0, 0, 0, 0, 0, 0), buttons=(0, 0)):
+    """What the mouse says; `t` tells a new report from an old one."""
+    axes = dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), twist, strict=True))
+    return SimpleNamespace(t=t, buttons=list(buttons), **axes)
+
+
+class FakeLibrary:
+    """pyspacemouse, and its one mouse."""
+
+    AxisConvention = SimpleNamespace(ROS="ros")
 
     def __init__(self):
-        self.report = self.make(t=-1.0)
-        self.fault: Exception | None = None
-        self.closed = False
+        self.report, self.fault, self.asked, self.closed = report(-1.0), None, [], False
 
-    @staticmethod
-    def make(t, twist=(0, 0, 0, 0, 0, 0), buttons=(0, 0)):
-        names = ("x", "y", "z", "roll", "pitch", "yaw")
-        return SimpleNamespace(t=t, buttons=list(buttons), **dict(zip(names, twist, strict=True)))
+    def open(self, axis_convention):
+        self.asked.append(axis_convention)
+        self.read()
+        return self
 
     def read(self):
         if self.fault is not None:
@@ -38,62 +44,57 @@ class FakeMouse:
 
 
 @pytest.fixture
-def library(monkeypatch):
-    """pyspacemouse with one mouse plugged in."""
-    library = SimpleNamespace(mouse=FakeMouse(), fault=None, asked=[], AxisConvention=SimpleNamespace(ROS="ros"))
-
-    def open_mouse(axis_convention):
-        library.asked.append(axis_convention)
-        if library.fault is not None:
-            raise library.fault
-        return library.mouse
-
-    library.open = open_mouse
-    monkeypatch.setitem(sys.modules, "pyspacemouse", library)
-    return library
+def mouse(monkeypatch):
+    mouse = FakeLibrary()
+    monkeypatch.setitem(sys.modules, "pyspacemouse", mouse)
+    return mouse
 
 
 @pytest.fixture
-def opened(library):
-    clock = Clock()
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def device(mouse, clock):
     device = make_device(clock, deadzone=0.2)
     device.open()
-    yield SimpleNamespace(device=device, clock=clock, mouse=library.mouse)
+    yield device
     device.close()
-    assert library.mouse.closed
+    assert mouse.closed
 
 
-def test_the_axes_of_ros_are_asked_for_and_small_deflections_are_none(opened, library):
-    assert library.asked == ["ros"]
-    assert not opened.device.read().twist.any()
-    opened.mouse.report = FakeMouse.make(1.0, (0.6, -0.2, 0.1, 1.2, -1.0, 0.0))
-    wait_until(lambda: opened.device.read().twist.any())
-    np.testing.assert_allclose(opened.device.read().twist, [0.5, 0, 0, 1, -1, 0], atol=1e-12)
+def test_the_axes_of_ros_are_asked_for_and_small_deflections_are_none(device, mouse):
+    assert mouse.asked == ["ros"]
+    assert not device.read().twist.any()
+    mouse.report = report(1.0, (0.6, -0.2, 0.1, 1.2, -1.0, 0.0))
+    wait_until(lambda: device.read().twist.any())
+    np.testing.assert_allclose(device.read().twist, [0.5, 0, 0, 1, -1, 0], atol=1e-12)
 
 
-def test_a_deflection_that_is_not_repeated_fades_but_a_button_stays(opened):
-    opened.mouse.report = FakeMouse.make(1.0, (1, 0, 0, 0, 0, 0), (1, 0))
-    wait_until(lambda: opened.device.read().twist.any())
-    opened.clock.now += 0.19
-    assert opened.device.read().twist[0] == 1
-    opened.clock.now += 0.02
-    state = opened.device.read()
+def test_a_deflection_that_is_not_repeated_fades_but_a_button_stays(device, mouse, clock):
+    mouse.report = report(1.0, (1, 0, 0, 0, 0, 0), (1, 0))
+    wait_until(lambda: device.read().twist.any())
+    clock.now += 0.19
+    assert device.read().twist[0] == 1
+    clock.now += 0.02
+    state = device.read()
     assert not state.twist.any()
     assert state.buttons == {"close"}
-    opened.mouse.report = FakeMouse.make(2.0, (1, 0, 0, 0, 0, 0), (0, 1))
-    wait_until(lambda: opened.device.read().buttons == {"open"})
-    assert opened.device.read().twist[0] == 1
+    mouse.report = report(2.0, (1, 0, 0, 0, 0, 0), (0, 1))
+    wait_until(lambda: device.read().buttons == {"open"})
+    assert device.read().twist[0] == 1
 
 
-def test_a_value_that_is_no_number_is_passed_on_to_be_seen(opened):
-    opened.mouse.report = FakeMouse.make(1.0, (float("nan"), 0, 0, 0, 0, 0))
-    wait_until(lambda: opened.device.read().fault() is not None)
+def test_a_value_that_is_no_number_is_passed_on_to_be_seen(device, mouse):
+    mouse.report = report(1.0, (float("nan"), 0, 0, 0, 0, 0))
+    wait_until(lambda: device.read().fault() is not None)
 
 
-def test_an_unplugged_mouse_is_told(opened):
-    opened.mouse.fault = OSError("Failed to read from HID device: -1")
+def test_an_unplugged_mouse_is_told(device, mouse):
+    mouse.fault = OSError("Failed to read from HID device: -1")
     with pytest.raises(DeviceLostError, match="plug it in"):
-        wait_until(lambda: opened.device.read() is None)
+        wait_until(lambda: device.read() is None)
 
 
 @pytest.mark.parametrize(
@@ -104,8 +105,8 @@ def test_an_unplugged_mouse_is_told(opened):
         (RuntimeError("No connected or supported devices found."), "plug one in"),
     ],
 )
-def test_what_is_missing_is_told_with_its_remedy(library, fault, remedy):
-    library.fault = fault
+def test_what_is_missing_is_told_with_its_remedy(mouse, fault, remedy):
+    mouse.fault = fault
     with pytest.raises(DeviceUnavailableError, match=remedy):
         make_device().open()
 
@@ -143,7 +144,7 @@ def words(channel, *values):
 
 
 @pytest.mark.parametrize(
-    ("report", "axis", "direction"),
+    ("raw", "axis", "direction"),
     [
         # USB's axes of the cap: x right, y towards the user, z down; rotations by the right-hand rule about them.
         (words(1, 0, -350, 0), 0, 1),
@@ -155,11 +156,11 @@ def words(channel, *values):
         (words(2, 0, 0, 350), 5, -1),
     ],
 )
-def test_raw_reports_become_axes_of_ros_in_the_real_library(monkeypatch, report, axis, direction):
+def test_raw_reports_become_axes_of_ros_in_the_real_library(monkeypatch, raw, axis, direction):
     pyspacemouse = pytest.importorskip("pyspacemouse", reason="needs the extra `spacemouse`")
     from pyspacemouse import api
 
-    hid = FakeHid(report, [3, 2, 0, 0, 0, 0, 0])
+    hid = FakeHid(raw, [3, 2, 0, 0, 0, 0, 0])
     hid.vendor_id, hid.product_id = pyspacemouse.get_device_specs()["SpaceMouseCompact"].hid_id
     monkeypatch.setattr(api, "Enumeration", lambda: SimpleNamespace(find=lambda: [hid]))
     device = make_device(deadzone=0.0, stale_after=1.0)

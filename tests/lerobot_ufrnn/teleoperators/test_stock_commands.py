@@ -9,12 +9,12 @@ import pytest
 import teleoperators_fakes as fakes
 from lerobot.configs.dataset import DatasetRecordConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.robots import Robot, RobotConfig
 from lerobot.scripts import lerobot_record, lerobot_teleoperate
 from lerobot.utils.constants import ACTION, OBS_STATE
 from scipy.spatial.transform import Rotation
 
 from env_door.scene import UR5E
+from lerobot_ufrnn.robots.ur5e_robotiq import UR5eRobotiqConfig, robot
 from lerobot_ufrnn.teleoperators import SpaceMouseTwistConfig, twist_teleoperator
 
 STEPS, PERIOD = 40, 0.1
@@ -25,54 +25,35 @@ def write(path, events):
     return path
 
 
-class FakeUR5e(Robot):
-    """Has the features of the real one and is always where it was sent; each observation lets a period pass."""
+class FakeServo:
+    """An arm that is at once where it is sent; a period passes with each target."""
 
-    config_class = RobotConfig
-    name = "fake_ur5e"
-    observation_features = action_features = dict.fromkeys(fakes.FEATURES, float)
-    is_connected, is_calibrated = False, True
-    cameras: dict = {}  # noqa: RUF012
+    fault = None
 
-    def __init__(self, world, folder):
-        self.world, self.robot_type, self.id, self.calibration_dir = world, self.name, None, folder
+    def __init__(self, world):
+        self.world = world
 
-    def calibrate(self):
-        pass
-
-    configure = calibrate
-
-    def connect(self, calibrate=True):
-        self.is_connected = True
+    def start(self):
         self.world.order.append("robot connected")
 
-    def disconnect(self):
-        self.is_connected = False
+    def stop(self):
         self.world.order.append("robot disconnected")
 
-    def get_observation(self):
+    def read(self):
+        return self.world.arm.measured, self.world.arm.measured
+
+    def move_to(self, target):
+        self.world.leads.append(np.abs(target - self.world.arm.measured).max())
+        self.world.sent.append(target)
+        self.world.arm.measured = target
         self.world.clock.now += PERIOD
-        return dict(zip(fakes.FEATURES, (*self.world.arm.measured, self.world.arm.gripper), strict=True))
-
-    def send_action(self, action):
-        target = np.array([action[name] for name in fakes.FEATURES])
-        self.world.actions.append(target)
-        self.world.leads.append(np.abs(target[:6] - self.world.arm.measured).max())
-        self.world.arm.measured, self.world.arm.gripper = target[:6], target[6]
-        if len(self.world.actions) == STEPS:
-            self.world.controls.update(exit_early=True)
-        return action
-
-
-@RobotConfig.register_subclass("fake_ur5e")
-class FakeUR5eConfig(RobotConfig):
-    """Nothing to configure."""
+        self.world.controls["exit_early"] = len(self.world.sent) == STEPS
 
 
 @pytest.fixture
-def world(monkeypatch, tmp_path):
-    """The fake arm, and what happens to it."""
-    world = SimpleNamespace(arm=fakes.FakeArmState(), clock=fakes.Clock(), actions=[], leads=[], order=[])
+def world(monkeypatch):
+    """The robot with a fake servo, and what happens to it."""
+    world = SimpleNamespace(arm=fakes.FakeArmState(), clock=fakes.Clock(), sent=[], leads=[], order=[])
     world.controls = {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
 
     def connect_arm(*_):
@@ -82,7 +63,8 @@ def world(monkeypatch, tmp_path):
     monkeypatch.setattr(twist_teleoperator, "ArmState", connect_arm)
     monkeypatch.setattr(twist_teleoperator, "monotonic", world.clock)
     monkeypatch.setattr(lerobot_record, "init_keyboard_listener", lambda: (None, world.controls))
-    monkeypatch.setattr(lerobot_record, "make_robot_from_config", lambda _: FakeUR5e(world, tmp_path))
+    monkeypatch.setattr(robot, "Servo", lambda _: FakeServo(world))
+    monkeypatch.setattr(robot.UR5eRobotiq, "_check_ready", lambda _: None)
     return world
 
 
@@ -98,7 +80,7 @@ def test_lerobot_record_writes_what_the_robot_was_sent(world, tmp_path):
     device = write(tmp_path / "events.jsonl", events)
     lerobot_record.record(
         lerobot_record.RecordConfig(
-            robot=FakeUR5eConfig(),
+            robot=UR5eRobotiqConfig(ip="192.0.2.1", gripper_port=0, calibration_dir=tmp_path),
             teleop=SpaceMouseTwistConfig(robot_ip="192.0.2.1", device=device, calibration_dir=tmp_path),
             dataset=DatasetRecordConfig(
                 repo_id="me/rehearsal",
@@ -115,22 +97,22 @@ def test_lerobot_record_writes_what_the_robot_was_sent(world, tmp_path):
     # The order is LeRobot's: it is why the teleoperator must not look where the arm is before the first action.
     assert world.order == ["teleoperator connected", "robot connected", "robot disconnected"]
     assert not world.arm.is_open
-    actions = np.array(world.actions)
-    np.testing.assert_array_equal(actions[0], [*fakes.READY, 0.0])
-    start, start_rotation = fakes.tool_pose(fakes.READY)
-    position, rotation = fakes.tool_pose(actions[-1, :6])
-    np.testing.assert_allclose(position - start, [0, 0, 1.0 * 0.5 * 0.1], atol=5e-5)
-    turned = (rotation * start_rotation.inv()) * Rotation.from_rotvec([1.0 * 0.6 * 0.5, 0, 0]).inv()
-    assert turned.magnitude() < 5e-4
-    assert actions[-1, 6] == pytest.approx(0.5)
-    assert max(world.leads) <= 0.07
-    assert np.abs(np.diff(actions[:, :6], axis=0)).max() <= 0.6 * PERIOD + 1e-9
-
     dataset = LeRobotDataset("me/rehearsal", root=tmp_path / "dataset")
     assert dataset.features[ACTION]["names"] == dataset.features[OBS_STATE]["names"] == fakes.FEATURES
     assert [f"{joint}.pos" for joint in (*UR5E.joints, "gripper")] == fakes.FEATURES
-    recorded = np.array(dataset.hf_dataset.with_format("numpy")[ACTION])
-    np.testing.assert_allclose(recorded, actions, atol=1e-6)
+    actions = np.array(dataset.hf_dataset.with_format("numpy")[ACTION])
+    joints = np.array(world.sent)
+    np.testing.assert_allclose(actions[:, :6], joints, atol=1e-6)
+
+    np.testing.assert_array_equal(joints[0], fakes.READY)
+    assert (actions[0, 6], actions[-1, 6]) == (0.0, pytest.approx(0.5))
+    start, start_rotation = fakes.tool_pose(fakes.READY)
+    position, rotation = fakes.tool_pose(joints[-1])
+    np.testing.assert_allclose(position - start, [0, 0, 1.0 * 0.5 * 0.1], atol=5e-5)
+    turned = (rotation * start_rotation.inv()) * Rotation.from_rotvec([1.0 * 0.6 * 0.5, 0, 0]).inv()
+    assert turned.magnitude() < 5e-4
+    assert max(world.leads) <= 0.07
+    assert np.abs(np.diff(joints, axis=0)).max() <= 0.6 * PERIOD + 1e-9
 
 
 def test_lerobot_teleoperate_moves_the_twin_along_and_nothing_else(tmp_path, monkeypatch):
