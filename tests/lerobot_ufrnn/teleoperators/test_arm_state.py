@@ -55,7 +55,7 @@ def test_a_controller_that_falls_silent_or_away_is_told_although_the_client_goes
     twin, arm, injection, told
 ):
     arm.joints()
-    twin.fault(injection)
+    twin.inject(injection)
     with pytest.raises(ArmStateError, match=told):
         wait_until(lambda: arm.joints() is None, 3.0)
 
