@@ -5,9 +5,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from lerobot_ufrnn.teleoperators import SpaceMouseTwistConfig
 from lerobot_ufrnn.teleoperators.tool_target import Hindrance, ToolTarget
 
 STRETCHED = np.array([0.0, -0.6, 0.02, -1.0, 1.2, 0.0])
+
+
+def make_target(**limits):
+    return ToolTarget(SpaceMouseTwistConfig(robot_ip="192.0.2.1", **limits))
 
 
 def drive(target, twist, steps, seconds=0.1, start=fakes.READY, follow=True):
@@ -24,7 +29,7 @@ def drive(target, twist, steps, seconds=0.1, start=fakes.READY, follow=True):
 def test_each_axis_moves_the_tool_along_or_about_itself_and_nothing_else(axis, direction):
     twist = np.zeros(6)
     twist[axis] = direction * (0.05 if axis < 3 else 0.3)
-    joints = drive(ToolTarget(), twist, 10)
+    joints = drive(make_target(), twist, 10)
     start, start_rotation = fakes.tool_pose(fakes.READY)
     position, rotation = fakes.tool_pose(joints)
     np.testing.assert_allclose(position, start + twist[:3], atol=5e-5)
@@ -33,11 +38,11 @@ def test_each_axis_moves_the_tool_along_or_about_itself_and_nothing_else(axis, d
 
 
 def test_at_rest_the_target_is_the_start_for_ever():
-    np.testing.assert_array_equal(drive(ToolTarget(), np.zeros(6), 1000), fakes.READY)
+    np.testing.assert_array_equal(drive(make_target(), np.zeros(6), 1000), fakes.READY)
 
 
 def test_going_there_and_back_leads_back_without_drift():
-    target = ToolTarget()
+    target = make_target()
     joints = target.start(fakes.READY)
     for _ in range(20):
         for sign in (1, 1, -1, -1):
@@ -52,7 +57,7 @@ def test_going_there_and_back_leads_back_without_drift():
     seconds=st.floats(0.001, 0.25),
 )
 def test_no_target_leaves_the_lead_or_is_too_fast_whatever_the_arm_does(twists, lags, seconds):
-    target = ToolTarget(joint_speed=0.6, max_lead=0.07)
+    target = make_target(joint_speed=0.6, max_lead=0.07)
     measured = fakes.READY.copy()
     before = target.start(measured)
     for twist, lag in zip(twists, lags, strict=False):
@@ -65,7 +70,7 @@ def test_no_target_leaves_the_lead_or_is_too_fast_whatever_the_arm_does(twists, 
 
 def test_a_joint_that_would_be_too_fast_slows_the_tool_down_on_its_way():
     twist = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
-    slow = ToolTarget(joint_speed=0.1)
+    slow = make_target(joint_speed=0.1)
     joints = drive(slow, twist, 5, seconds=0.02)
     moved = fakes.tool_pose(joints)[0] - fakes.tool_pose(fakes.READY)[0]
     assert 0 < moved[2] < 0.3 * 5 * 0.02
@@ -73,7 +78,7 @@ def test_a_joint_that_would_be_too_fast_slows_the_tool_down_on_its_way():
 
 
 def test_a_blocked_arm_is_told_and_may_be_led_back_at_once():
-    target = ToolTarget(max_lead=0.07)
+    target = make_target(max_lead=0.07)
     ahead = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     joints = drive(target, ahead, 30, follow=False)
     assert target.hindrance is Hindrance.BLOCKED
@@ -84,7 +89,7 @@ def test_a_blocked_arm_is_told_and_may_be_led_back_at_once():
 
 
 def test_the_target_follows_an_arm_that_something_else_moves():
-    target = ToolTarget(max_lead=0.07)
+    target = make_target(max_lead=0.07)
     target.start(fakes.READY)
     elsewhere = fakes.READY + np.array([0.5, 0, 0, 0, 0, 0])
     joints = target.step(np.zeros(6), 0.1, elsewhere)
@@ -97,7 +102,7 @@ def test_the_target_follows_an_arm_that_something_else_moves():
 
 
 def test_out_of_reach_the_target_stays_inside_and_can_be_led_back():
-    target = ToolTarget()
+    target = make_target()
     up = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     joints = drive(target, up, 200)
     assert target.hindrance in (Hindrance.UNREACHABLE, Hindrance.NEAR_SINGULAR)
@@ -122,7 +127,7 @@ def manipulability(joints):
 
 def test_the_tool_is_not_led_into_a_singular_pose_but_out_of_one():
     assert manipulability(STRETCHED) < 0.01
-    target = ToolTarget(min_manipulability=0.01)
+    target = make_target(min_manipulability=0.01)
     joints = target.start(STRETCHED)
     position, _ = fakes.tool_pose(STRETCHED)
     outward = (position - [0, 0, 0.1625]) / np.linalg.norm(position - [0, 0, 0.1625])
@@ -135,7 +140,7 @@ def test_the_tool_is_not_led_into_a_singular_pose_but_out_of_one():
 
 def test_a_walk_never_falls_below_the_least_manipulability():
     rng = np.random.default_rng(0)
-    target = ToolTarget(min_manipulability=0.02)
+    target = make_target(min_manipulability=0.02)
     joints = target.start(fakes.READY)
     for _ in range(30):
         twist = np.append(rng.uniform(-0.3, 0.3, 3), rng.uniform(-1, 1, 3))
@@ -148,4 +153,4 @@ def test_joints_beyond_their_range_are_refused_by_name():
     outside = fakes.READY.copy()
     outside[2] = 3.3
     with pytest.raises(ValueError, match=r"elbow are at \[3\.3\] rad.*pendant"):
-        ToolTarget().start(outside)
+        make_target().start(outside)

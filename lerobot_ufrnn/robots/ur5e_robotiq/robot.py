@@ -2,7 +2,12 @@
 
 import contextlib
 import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
 from functools import cached_property
+from types import FrameType
 from typing import Any
 
 import cv2
@@ -11,19 +16,30 @@ from lerobot.cameras import make_cameras_from_configs
 from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
+from numpy.typing import NDArray
 
-from .client import import_client
-from .configuration_ur5e_robotiq import FEATURES, UR5eRobotiqConfig
-from .errors import Fault, RobotFaultError
-from .gripper import Gripper
+from .configuration import FEATURES, UR5eRobotiqConfig
+from .faults import Fault, RobotFaultError
+from .gripper import RobotiqGripper
 from .limits import Limits
-from .orderly_end import OrderlyEnd
-from .picture_check import PictureCheck
-from .servo import Servo
+from .servo import Servo, import_client
 
 logger = logging.getLogger(__name__)
 
 MAX_IMAGE_AGE_MS = 500
+"""Age in ms from which an image shows something else than the measured joints."""
+
+DARK = 4.0
+"""Mean of an image, of 255, below which it shows nothing."""
+
+WRONG_SECONDS = 1.0
+"""For how long an image must be wrong; a camera may lose a frame or adjust itself."""
+
+MOVED = 0.05
+"""Distance in rad, of any joint, that cannot leave an image of the arm the same to the last bit."""
+
+ENDING_SIGNALS = ("SIGTERM", "SIGHUP")
+"""`kill`, the end of a service, a terminal or connection that is closed. Not all systems have both."""
 
 
 class UR5eRobotiq(Robot):
@@ -47,7 +63,7 @@ class UR5eRobotiq(Robot):
         self.cameras = make_cameras_from_configs(config.cameras)
         self._limits = Limits(config)
         self._servo: Servo | None = None
-        self._gripper: Gripper | None = None
+        self._gripper: RobotiqGripper | None = None
         self._pictures: dict[str, PictureCheck] = {}
         self._fault: RobotFaultError | None = None
         self._warned = False
@@ -87,10 +103,6 @@ class UR5eRobotiq(Robot):
     def connect(self, calibrate: bool = True) -> None:
         """Connects cameras, gripper and arm, in this order, and holds the arm where it is.
 
-        Args:
-            calibrate (`bool`, *optional*, defaults to `True`):
-                Unused.
-
         Raises:
             RobotFaultError: If one of them is not ready; nothing stays connected.
         """
@@ -105,7 +117,7 @@ class UR5eRobotiq(Robot):
                 except Exception as error:
                     raise RobotFaultError(Fault.CAMERA, f"camera '{name}' cannot be opened: {error}") from error
             if self.config.gripper_port:
-                self._gripper = Gripper(self.config)
+                self._gripper = RobotiqGripper(self.config)
                 self._gripper.connect()
             self._servo = Servo(self.config)
             self._servo.start()
@@ -200,7 +212,7 @@ class UR5eRobotiq(Robot):
         logger.info("%s disconnected.", self)
 
     @contextlib.contextmanager
-    def _stopping_on_fault(self) -> Any:
+    def _stopping_on_fault(self) -> Iterator[None]:
         if self._fault is not None:
             raise self._fault
         try:
@@ -231,17 +243,7 @@ class UR5eRobotiq(Robot):
 
 
 def fit_image(image: np.ndarray, size: int) -> np.ndarray:
-    """The middle square of an image, resized.
-
-    Args:
-        image (`np.ndarray`):
-            Image, (height, width, 3).
-        size (`int`):
-            Height and width of the result; 0 leaves the image as it is.
-
-    Returns:
-        `np.ndarray`: image, (size, size, 3).
-    """
+    """The middle square of an image, (height, width, 3), resized to `size`; 0 leaves it as it is."""
     if not size:
         return image
     height, width = image.shape[:2]
@@ -249,3 +251,77 @@ def fit_image(image: np.ndarray, size: int) -> np.ndarray:
     top, left = (height - side) // 2, (width - side) // 2
     square = image[top : top + side, left : left + side]
     return cv2.resize(square, (size, size), interpolation=cv2.INTER_AREA)
+
+
+class PictureCheck:
+    """Notices images of a camera that arrive in time and still show nothing: black ones, and one that never changes."""
+
+    def __init__(self, camera: str, clock: Callable[[], float] = time.monotonic):
+        self._camera = camera
+        self._clock = clock
+        self._dark_since: float | None = None
+        self._last: NDArray[np.uint8] | None = None
+        self._last_since = 0.0
+        self._last_joints: NDArray[np.float64] = np.empty(0)
+
+    def check(self, image: NDArray[np.uint8], joints: NDArray[np.float64]) -> None:
+        """Looks at a picture, (height, width, 3), taken at measured joints in rad, (6,).
+
+        Raises a `RobotFaultError` if pictures have been black, or the same although the arm moved, for a second.
+        """
+        now = self._clock()
+        if image.mean() >= DARK:
+            self._dark_since = None
+        elif self._dark_since is None:
+            self._dark_since = now
+        elif now - self._dark_since >= WRONG_SECONDS:
+            raise RobotFaultError(
+                Fault.CAMERA, f"camera '{self._camera}' has been black for {now - self._dark_since:.1f} s"
+            )
+        if self._last is None or not np.array_equal(image, self._last):
+            self._last, self._last_since, self._last_joints = image.copy(), now, joints.copy()
+        elif now - self._last_since >= WRONG_SECONDS and np.abs(joints - self._last_joints).max() >= MOVED:
+            raise RobotFaultError(
+                Fault.CAMERA,
+                f"camera '{self._camera}' has sent the same picture for {now - self._last_since:.1f} s, in which the "
+                f"arm moved by {np.abs(joints - self._last_joints).max():.2f} rad",
+            )
+
+
+class OrderlyEnd:
+    """Lets a program that is told to end do so in order: as with Ctrl-C, what it has to close is closed.
+
+    Python ends at once on these signals. The arm is stopped in any case, but `lerobot-record` would lose every episode
+    of its session: LeRobot writes the ends of the files, without which they cannot be read, when the recording ends.
+    A program that deals with a signal by itself, or ignores it as under `nohup`, goes on doing so.
+    """
+
+    def __init__(self) -> None:
+        self._taken: list[int] = []
+
+    def begin(self) -> None:
+        """From now on these signals raise `SystemExit`. Only the main thread may do this; in others nothing happens."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for name in ENDING_SIGNALS:
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) == signal.SIG_DFL:
+                signal.signal(number, self._end)
+                self._taken.append(number)
+
+    def end(self) -> None:
+        """Restores what was before. Safe to call at any time."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        while self._taken:
+            number = self._taken.pop()
+            # Somebody else may have taken the signal over meanwhile.
+            if signal.getsignal(number) in (self._end, signal.SIG_IGN):
+                signal.signal(number, signal.SIG_DFL)
+
+    def _end(self, number: int, frame: FrameType | None) -> Any:
+        for taken in self._taken:
+            # Asked for once more, the program would be torn from what it closes.
+            signal.signal(taken, signal.SIG_IGN)
+        logger.warning("Ending, as asked for by %s: what is open is closed first.", signal.Signals(number).name)
+        raise SystemExit(128 + number)

@@ -1,7 +1,6 @@
 """A 3Dconnexion SpaceMouse through `pyspacemouse`."""
 
 import contextlib
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -9,15 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from .device import CLOSE, OPEN, DeviceState, TwistDevice
-from .errors import DeviceLostError, DeviceUnavailableError
-
-logger = logging.getLogger(__name__)
+from .configuration import SpaceMouseTwistConfig
+from .device import CLOSE, OPEN, DeviceLostError, DeviceState, DeviceUnavailableError, TwistDevice
 
 POLL_SECONDS = 0.002
 """Pause between two looks for a report; a deflected cap sends two every 8 ms."""
 
 JOIN_SECONDS = 1.0
+"""How long the thread may take to end."""
 
 PERMISSIONS = (
     'a rule such as KERNEL=="hidraw*", ATTRS{idVendor}=="256f", MODE="0660", TAG+="uaccess" in '
@@ -33,19 +31,11 @@ class SpaceMouseDevice(TwistDevice):
 
     A thread reads all reports as they come: the kernel keeps only 64 and then drops the newest, so that after a pause
     a reader would take an old deflection for the present one.
-
-    Args:
-        deadzone (`float`, *optional*, defaults to `0.1`):
-            Deflection up to which the cap counts as untouched.
-        stale_after (`float`, *optional*, defaults to `0.2`):
-            Seconds after the last report for which a deflection counts.
-        clock (`Callable[[], float]`, *optional*, defaults to `time.monotonic`):
-            Time in seconds.
     """
 
-    def __init__(self, deadzone: float = 0.1, stale_after: float = 0.2, clock: Callable[[], float] = time.monotonic):
-        self._deadzone = deadzone
-        self._stale_after = stale_after
+    def __init__(self, config: SpaceMouseTwistConfig, clock: Callable[[], float] = time.monotonic):
+        self._deadzone = config.deadzone
+        self._stale_after = config.stale_after
         self._clock = clock
         self._mouse: Any = None
         self._thread: threading.Thread | None = None
@@ -55,11 +45,7 @@ class SpaceMouseDevice(TwistDevice):
         self._loss: Exception | None = None
 
     def open(self) -> None:
-        """Opens the first SpaceMouse.
-
-        Raises:
-            DeviceUnavailableError: If the library, the permission or the mouse is missing.
-        """
+        """Opens the first SpaceMouse."""
         try:
             import pyspacemouse
         except ImportError as error:
@@ -79,11 +65,7 @@ class SpaceMouseDevice(TwistDevice):
         self._thread.start()
 
     def read(self) -> DeviceState:
-        """The cap and the buttons now.
-
-        Raises:
-            DeviceLostError: If the mouse was unplugged.
-        """
+        """The cap and the buttons now."""
         if self._loss is not None:
             raise DeviceLostError(
                 f"The SpaceMouse is gone ({self._loss}): plug it in (or charge it) and start the command again."

@@ -4,13 +4,14 @@ import contextlib
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from waiting import wait_until
 
 from lerobot_ufrnn.robots.ur5e_robotiq import Fault, RobotFaultError, UR5eRobotiqConfig
 from lerobot_ufrnn.robots.ur5e_robotiq import gripper as gripper_module
-from lerobot_ufrnn.robots.ur5e_robotiq.gripper import Gripper
+from lerobot_ufrnn.robots.ur5e_robotiq.gripper import RobotiqGripper
 
 
 class FakeGripper:
@@ -50,51 +51,25 @@ class FakeGripper:
 
 
 @pytest.fixture
-def fake(monkeypatch):
+def connect(monkeypatch):
+    """Connects to a fake gripper."""
     monkeypatch.setattr(gripper_module, "TIMEOUT", 0.3)
-    fakes = []
+    open_ones = []
 
-    def make(**settings) -> FakeGripper:
-        fakes.append(FakeGripper(**settings))
-        return fakes[-1]
-
-    yield make
-    for each in fakes:
-        each.close()
-
-
-@pytest.fixture
-def connected(fake):
-    grippers = []
-
-    def connect(server: FakeGripper, **settings) -> Gripper:
-        config = UR5eRobotiqConfig(ip="127.0.0.1", gripper_port=server.port, **settings)
-        grippers.append(Gripper(config))
-        grippers[-1].connect()
-        return grippers[-1]
+    def connect(server: FakeGripper, **settings) -> RobotiqGripper:
+        gripper = RobotiqGripper(UR5eRobotiqConfig(ip="127.0.0.1", gripper_port=server.port, **settings))
+        open_ones.extend([gripper.disconnect, server.close])
+        gripper.connect()
+        return gripper
 
     yield connect
-    for each in grippers:
-        each.disconnect()
+    for close in open_ones:
+        close()
 
 
-def raises_soon(gripper: Gripper) -> RobotFaultError:
-    found = []
-
-    def failed() -> bool:
-        try:
-            gripper.closure  # noqa: B018
-        except RobotFaultError as error:
-            found.append(error)
-        return bool(found)
-
-    wait_until(failed)
-    return found[0]
-
-
-def test_an_active_gripper_is_not_moved_by_connecting(fake, connected):
-    server = fake()
-    gripper = connected(server, gripper_force=0.2, gripper_speed=1.0)
+def test_an_active_gripper_is_not_moved_by_connecting(connect):
+    server = FakeGripper()
+    gripper = connect(server, gripper_force=0.2, gripper_speed=1.0)
     assert gripper.closure == 0
     assert "SET GTO 1 SPE 255 FOR 51" in server.commands
     assert not any("ACT" in command for command in server.commands)
@@ -102,17 +77,17 @@ def test_an_active_gripper_is_not_moved_by_connecting(fake, connected):
     assert not any(command.startswith("SET POS") for command in server.commands)
 
 
-def test_a_gripper_that_is_not_active_is_activated_first(fake, connected):
-    server = fake(status=0)
-    connected(server, gripper_force=0.2)
+def test_a_gripper_that_is_not_active_is_activated_first(connect):
+    server = FakeGripper(status=0)
+    connect(server, gripper_force=0.2)
     assert server.commands.index("SET ACT 1 GTO 1") < server.commands.index("SET GTO 1 SPE 255 FOR 51")
 
 
 @pytest.mark.parametrize(("closure", "position"), [(0.0, 3), (0.5, 116), (1.0, 230)])
-def test_targets_and_readings_share_one_scale(fake, connected, closure, position):
-    server = fake()
+def test_targets_and_readings_share_one_scale(connect, closure, position):
+    server = FakeGripper()
     server.values["POS"] = 99
-    gripper = connected(server)
+    gripper = connect(server)
     gripper.move_to(closure)
     wait_until(lambda: server.values["POS"] == position)
     wait_until(lambda: gripper.closure == pytest.approx(closure, abs=0.005))
@@ -120,20 +95,20 @@ def test_targets_and_readings_share_one_scale(fake, connected, closure, position
     assert sent == [f"SET POS {position}"]  # once, not at every poll
 
 
-def test_a_reading_beyond_the_range_is_open_or_closed(fake, connected):
-    server = fake()
-    gripper = connected(server)
+def test_a_reading_beyond_the_range_is_open_or_closed(connect):
+    server = FakeGripper()
+    gripper = connect(server)
     server.values["POS"] = 255
     wait_until(lambda: gripper.closure == 1.0)
     server.values["POS"] = 0
     wait_until(lambda: gripper.closure == 0.0)
 
 
-def test_where_nobody_listens_there_is_no_gripper():
+def test_where_nobody_listens_there_is_no_gripper(connect):
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = listener.getsockname()[1]
+        nobody = SimpleNamespace(port=listener.getsockname()[1], close=lambda: None)
     with pytest.raises(RobotFaultError, match="does not answer") as error:
-        Gripper(UR5eRobotiqConfig(ip="127.0.0.1", gripper_port=port)).connect()
+        connect(nobody)
     assert error.value.fault is Fault.GRIPPER_SILENT
 
 
@@ -146,31 +121,32 @@ def test_where_nobody_listens_there_is_no_gripper():
     ],
 )
 @pytest.mark.parametrize("before", [True, False])
-def test_what_breaks_before_or_while_connected_is_told(fake, connected, breaks, fault, message, before):
-    server = fake()
+def test_what_breaks_before_or_while_connected_is_told(connect, breaks, fault, message, before):
+    server = FakeGripper()
     if before:
         breaks(server)
         with pytest.raises(RobotFaultError, match=message) as error:
-            connected(server)
+            connect(server)
         assert error.value.fault is fault
         return
-    gripper = connected(server)
+    gripper = connect(server)
     breaks(server)
-    told = raises_soon(gripper)
-    assert told.fault is fault
+    with pytest.raises(RobotFaultError, match=message) as error:
+        wait_until(lambda: gripper.closure < 0)
+    assert error.value.fault is fault
     with pytest.raises(RobotFaultError, match=message):
         gripper.move_to(0.5)
 
 
-def test_a_lesser_fault_only_says_that_it_is_not_ready(fake, connected):
-    server = fake()
+def test_a_lesser_fault_only_says_that_it_is_not_ready(connect):
+    server = FakeGripper()
     server.values["FLT"] = 5
-    assert connected(server).closure == 0
+    assert connect(server).closure == 0
 
 
-def test_disconnecting_neither_opens_nor_closes(fake, connected):
-    server = fake()
-    gripper = connected(server)
+def test_disconnecting_neither_opens_nor_closes(connect):
+    server = FakeGripper()
+    gripper = connect(server)
     gripper.move_to(0.7)
     wait_until(lambda: server.values["POS"] > 100)
     before = len([command for command in server.commands if command.startswith("SET")])
