@@ -13,7 +13,6 @@ from ..foresight import uncertainty
 from ..modeling_ufrnn import UFRNNPolicy
 from .trial import Imagination, TrialHistory
 
-STRIP_COLUMNS = 5
 MOST_SHOWN = 5
 
 
@@ -62,50 +61,6 @@ def draw(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
         tried = ", ".join(direction for _, direction in history.attempts) or "nothing"
         result = "opened" if history.success else "not opened"
         figure.suptitle(f"What was imagined (in truth a {history.door_kind} door; tried: {tried}; {result})")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
-
-
-def draw_strip(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
-    """Draws imagined futures of a decisive step beside what happened, and writes them to `path`.
-
-    One row a candidate, the kept one marked, and the camera in the last row; one column a step.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            The policy that ran the trial.
-        history (`TrialHistory`):
-            The trial.
-        path (`Path`):
-            Where to write the PNG.
-
-    Raises:
-        ValueError: If nothing was imagined in the trial.
-    """
-    joint_dim, camera = policy.model.network.joint_dim, policy.config.cameras[0]
-    imagined = decisive(history, joint_dim)
-    rows = _representatives(imagined, joint_dim)
-    features = imagined.futures.mean[:, rows, joint_dim:]  # (T, n, D_f)
-    columns = range(0, len(features), max(2, -(-len(features) // STRIP_COLUMNS)))
-    with matplotlib.rc_context({"font.size": 9}):
-        figure = Figure(figsize=(1.1 + 1.25 * len(columns), 0.7 + 1.3 * (len(rows) + 1)), layout="constrained")
-        panels = figure.subplots(len(rows) + 1, len(columns), squeeze=False)
-        for column, index in enumerate(columns):
-            ahead = imagined.ahead + index
-            now = imagined.step + ahead
-            pictures = [*_decode(policy, features[index], camera), *history.images[now : now + 1]]
-            for panel, picture in zip(panels[:, column], pictures, strict=False):
-                panel.imshow(picture)
-            panels[0, column].set_title(f"t + {ahead}", fontsize=9)
-            for number, panel in zip([*rows, None], panels[:, column], strict=True):
-                _frame(panel, number == imagined.chosen)
-            if len(pictures) == len(rows):
-                panels[-1, column].text(0.5, 0.5, "trial over", ha="center", va="center", fontsize=8)
-        for number, panel in zip(rows, panels[:-1, 0], strict=True):
-            label = f"future {number + 1}" + ("\n(kept)" if number == imagined.chosen else "")
-            panel.set_ylabel(label, color="C3" if number == imagined.chosen else "black")
-        panels[-1, 0].set_ylabel("what\nhappened")
-        figure.suptitle(f"Imagined at step t = {imagined.step} of a trial with a {history.door_kind} door", fontsize=10)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=110)
 

@@ -2,6 +2,8 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import gymnasium as gym
 from lerobot.configs import PreTrainedConfig
 
 import env_door  # noqa: F401  registers the environment
+from env_door.checks import check_range
 from env_door.provenance import PROVENANCE_PATH, Provenance
 
 from ..analysis.trial import TrialHistory, run_trial
@@ -16,6 +19,50 @@ from ..modeling_ufrnn import UFRNNPolicy
 
 MODEL_NAMES = {"foresight": "UF-RNN", "noise": "SH-RNN+noise", "none": "SH-RNN"}
 """What the paper calls a policy with this exploration."""
+
+
+@dataclass(kw_only=True)
+class DoorTrialConfig:
+    """Which trial to run; the commands that run one add their own flags."""
+
+    kind: str = "any"
+    """Kind of the door: `push`, `pull`, `slide` or `random`; `any` takes the first of the three that shows something."""
+    arm: str = "ur5e"
+    """`ur5e` or `panda`."""
+    door_offset: float = 0.0
+    """Half-width in metres of the range of the door's shift."""
+    seed: int = 2000
+    """Seed of environment and exploration noise."""
+    num_steps: int = 300
+    """Longest trial in steps."""
+
+    def __post_init__(self) -> None:
+        check_range(self, "num_steps", low=1)
+
+
+def run_door_trial(
+    policy: UFRNNPolicy, config: DoorTrialConfig, kind: str, film: bool = False, **options: Any
+) -> TrialHistory:
+    """Runs one trial with a door.
+
+    Args:
+        policy (`UFRNNPolicy`):
+            Trained policy.
+        config (`DoorTrialConfig`):
+            Which trial.
+        kind (`str`):
+            Kind of the door, in place of the configuration's.
+        film (`bool`, *optional*, defaults to `False`):
+            Keep a picture of each step.
+        **options (`Any`):
+            Further options of [`~env_door.env.DoorEnv`].
+
+    Returns:
+        `TrialHistory`: the trial.
+    """
+    settings = {"max_episode_steps": config.num_steps, "arm": config.arm, "door_offset": config.door_offset}
+    with closing(gym.make("env_door/Door-v0", kind=kind, **settings, **options)) as env:
+        return run_trial(policy, env, config.seed, film)
 
 
 def load_policy(path: str) -> UFRNNPolicy:
@@ -62,29 +109,6 @@ def load_policies(paths: Sequence[str], labels: Sequence[str]) -> dict[str, UFRN
     if len(set(names)) != len(names):
         raise ValueError(f"The policies would be called {names}; tell them apart with --labels=[...].")
     return dict(zip(names, policies, strict=True))
-
-
-def run_door_trial(policy: UFRNNPolicy, seed: int, num_steps: int, **options: Any) -> TrialHistory:
-    """Runs one trial with a door.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            Trained policy.
-        seed (`int`):
-            Seed of environment and exploration noise.
-        num_steps (`int`):
-            Longest trial in steps.
-        **options (`Any`):
-            Options of [`~env_door.env.DoorEnv`].
-
-    Returns:
-        `TrialHistory`: the trial.
-    """
-    env = gym.make("env_door/Door-v0", max_episode_steps=num_steps, **options)
-    try:
-        return run_trial(policy, env, seed)
-    finally:
-        env.close()
 
 
 def read_provenance(dataset_dir: Path) -> Provenance | None:
