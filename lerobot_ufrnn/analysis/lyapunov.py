@@ -1,9 +1,10 @@
 """Local Lyapunov exponents of imagination: how fast futures part that begin with nearly the same state (Sec. IV-F).
 
-Over few steps a result depends on the perturbation to start from. This is the one that grows most over just these steps:
-the exponent is the logarithm of the largest singular value of the whole stretch's Jacobian (Abarbanel, Brown and Kennel
-1991, J. Nonlinear Sci. 1, 175-199), which is never built: Jacobians push a frame of tangent vectors along the trajectory,
-their transposes pull it back, and it is re-orthonormalised at every step (after Benettin et al. 1980, Meccanica 15, 9-30).
+Over few steps a result depends on the perturbation to start from. This is the one that grows most over just these
+steps: the exponent is the logarithm of the largest singular value of the whole stretch's Jacobian (Abarbanel, Brown and
+Kennel 1991, J. Nonlinear Sci. 1, 175-199). That is never built: Jacobians push a frame of tangent vectors along the
+trajectory, their transposes pull it back, and it is re-orthonormalised at every step (after Benettin et al. 1980,
+Meccanica 15, 9-30).
 """
 
 from collections.abc import Callable, Sequence

@@ -22,8 +22,8 @@ HELD_RATES = {
     "tried another way meanwhile": ("tried_another_way", "held"),
 }
 WHAT_INTERVALS_ARE_OVER = (
-    "In brackets: 95 % Wilson intervals over the trials of one network; networks that were trained with other seeds may "
-    "differ by more.\n"
+    "In brackets: 95 % Wilson intervals over the trials of one network; networks trained with other seeds may differ "
+    "by more.\n"
 )
 
 

@@ -25,8 +25,8 @@ PARTS = {
     ),
     "foresight.png": (
         "Imagined futures",
-        "Top: what the camera saw, what the autoencoder keeps of it, and the image that ends each imagined future. Below: "
-        "the joint that the futures disagree most about, and the predicted variance over the trial.",
+        "Top: what the camera saw, what the autoencoder keeps of it, and the image that ends each imagined future. "
+        "Below: the joint that the futures disagree most about, and the predicted variance over the trial.",
         "ufrnn foresight --policy_path=... --output={folder}/foresight.png",
     ),
     "hidden.png": (
@@ -42,8 +42,8 @@ PARTS = {
     ),
     "lyapunov.png": (
         "Lyapunov exponents",
-        "How fast imagined futures part that began with nearly the same hidden state: above 0 small noise grows, so that "
-        "imagination explores; below 0 it dies out. Grey bars mark where phases of the task begin.",
+        "How fast imagined futures part that began with nearly the same hidden state: above 0 small noise grows, so "
+        "that imagination explores; below 0 it dies out. Grey bars mark where phases of the task begin.",
         "ufrnn lyapunov --policy_paths=[...] --dataset_dir=... --output={folder}/lyapunov.png",
     ),
 }
