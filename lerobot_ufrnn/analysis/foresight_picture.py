@@ -111,7 +111,7 @@ def _title(policy: UFRNNPolicy, imagined: Imagination, number: int) -> str:
     if imagined.refuted is not None:
         return f"future {number + 1}{kept}\nlike a failed try: {min(imagined.refuted[number], 1):.0%}"
     network, foresight = policy.model.network, policy.model.foresight
-    final = uncertainty(imagined.futures.log_variance[-1, number], network.joint_dim, foresight.aggregation)
+    final = uncertainty(imagined.futures.log_variance[-1, number], network.joint_dim, foresight.config.variance_aggregation)
     return f"future {number + 1}{kept}\nuncertainty {final:.3g}"
 
 

@@ -123,7 +123,7 @@ def train(config: DemoConfig) -> None:
         flags = [
             "--policy.type=ufrnn",
             f"--policy.exploration={config.exploration}",
-            f"--policy.autoencoder_steps={config.autoencoder_steps}",
+            f"--policy.autoencoder.steps={config.autoencoder_steps}",
             f"--policy.device={config.device}",
             f"--dataset.repo_id={REPO_ID}",
             f"--dataset.root={config.dataset_dir}",
