@@ -21,17 +21,6 @@ def draw(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
 
     Top: the camera, its reconstruction, and imagined images at the horizon. Below: the imagined paths of the joint that
     the candidates disagree most about, and the predicted variance over the whole trial.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            The policy that ran the trial.
-        history (`TrialHistory`):
-            The trial.
-        path (`Path`):
-            Where to write the PNG.
-
-    Raises:
-        ValueError: If nothing was imagined in the trial.
     """
     imagined = decisive(history, policy.model.network.joint_dim)
     camera, joint_dim = policy.config.cameras[0], policy.model.network.joint_dim
@@ -71,15 +60,6 @@ def decisive(history: TrialHistory, joint_dim: int) -> Imagination:
     With recall the last time that the trial went back, which a door that was opened was opened by. With foresight at
     every step the one whose futures part most in the 2 s before the first try (before the end, without one).
 
-    Args:
-        history (`TrialHistory`):
-            The trial.
-        joint_dim (`int`):
-            Number of joints.
-
-    Returns:
-        `Imagination`: the futures of that step.
-
     Raises:
         ValueError: If nothing was imagined in the trial.
     """
@@ -110,8 +90,8 @@ def _title(policy: UFRNNPolicy, imagined: Imagination, number: int) -> str:
     kept = " (kept)" if number == imagined.chosen else ""
     if imagined.refuted is not None:
         return f"future {number + 1}{kept}\nlike a failed try: {min(imagined.refuted[number], 1):.0%}"
-    network, foresight = policy.model.network, policy.model.foresight
-    final = uncertainty(imagined.futures.log_variance[-1, number], network.joint_dim, foresight.config.variance_aggregation)
+    aggregation = policy.config.foresight.variance_aggregation
+    final = uncertainty(imagined.futures.log_variance[-1, number], policy.model.network.joint_dim, aggregation)
     return f"future {number + 1}{kept}\nuncertainty {final:.3g}"
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -46,21 +47,7 @@ class HiddenPaths:
 
     @classmethod
     def of(cls, label: str, kinds: list[str], states: Sequence[HiddenState], history: TrialHistory) -> "HiddenPaths":
-        """Fits the plane to demonstrations and puts them and a trial on it.
-
-        Args:
-            label (`str`):
-                Name of the model.
-            kinds (`list[str]`):
-                Kind of each demonstration.
-            states (`Sequence[HiddenState]`):
-                States along each, (L, hidden size) each.
-            history (`TrialHistory`):
-                The trial.
-
-        Returns:
-            `HiddenPaths`: the paths.
-        """
+        """Fits the plane to the states along demonstrations and puts them and a trial on it."""
         plane = Plane.fit(torch.cat([of_episode.h_shared for of_episode in states]))
         first, second = plane.shares.tolist()
         return cls(
@@ -74,16 +61,10 @@ class HiddenPaths:
 
 
 def draw(models: Sequence[HiddenPaths], path: Path) -> None:
-    """Draws a panel a model and writes them to `path`.
+    """Draws a panel a model and writes them to `path`, whose ending chooses the format.
 
     Each demonstration is a pale line, the mean of each kind a dotted one. The trial is the black line; what it tries
     shows in the colour of that kind, and the time for which somebody held the door is highlighted.
-
-    Args:
-        models (`Sequence[HiddenPaths]`):
-            The models.
-        path (`Path`):
-            Where to write the picture; its ending chooses the format.
     """
     num_columns = min(len(models), PANELS_PER_ROW)
     num_rows = -(-len(models) // num_columns)
@@ -144,16 +125,13 @@ def _draw_model(panel: Axes, model: HiddenPaths) -> None:
 
 def _legend(kinds: list[str], with_held: bool) -> list[Line2D]:
     def marker(shape: str, size: float, face: str, label: str) -> Line2D:
-        return Line2D(
-            [],
-            [],
-            marker=shape,
-            markersize=size,
-            markerfacecolor=face,
-            markeredgecolor="black",
-            linestyle="none",
-            label=label,
-        )
+        style: dict[str, Any] = {
+            "markersize": size,
+            "markerfacecolor": face,
+            "markeredgecolor": "black",
+            "linestyle": "none",
+        }
+        return Line2D([], [], marker=shape, label=label, **style)
 
     handles = [
         Line2D([], [], color=DOOR_COLORS.get(kind, OTHER_COLOR), linestyle=":", linewidth=2, label=f"{kind} (offline)")
@@ -163,12 +141,8 @@ def _legend(kinds: list[str], with_held: bool) -> list[Line2D]:
     if with_held:
         handles.append(Line2D([], [], color=HELD_COLOR, linewidth=6, alpha=0.6, label="door held"))
     handles.append(marker(".", 8, "black", "start of the trial"))
-    return [
-        *handles,
-        marker("o", 9, "white", "first try"),
-        marker("s", 5, "white", "further try"),
-        marker("*", 13, "white", "opened"),
-    ]
+    tries = [marker("o", 9, "white", "first try"), marker("s", 5, "white", "further try")]
+    return [*handles, *tries, marker("*", 13, "white", "opened")]
 
 
 def to_table(models: Sequence[HiddenPaths]) -> pd.DataFrame:

@@ -23,20 +23,10 @@ NUM_VECTORS = 3
 
 
 def exponents_over_time(network: SHLSTM, states: Sequence[HiddenState], num_steps: int) -> list[np.ndarray]:
-    """Largest local Lyapunov exponent of the imagined future at each moment.
+    """Largest local Lyapunov exponent of the imagined future at each moment of some episodes.
 
-    From each state that the model had, the closed loop runs for `num_steps`, as in foresight but without noise.
-
-    Args:
-        network (`SHLSTM`):
-            The network that imagines.
-        states (`Sequence[HiddenState]`):
-            States over time, (L, hidden size) each, of any number of episodes.
-        num_steps (`int`):
-            Number of imagined steps T.
-
-    Returns:
-        `list[np.ndarray]`: for each episode the exponent at each step in 1/step, (L,).
+    From each state that the model had, (L, hidden size) each, the closed loop runs for `num_steps`, as in foresight but
+    without noise. Returns the exponents of each episode in 1/step, (L,).
     """
     step = closed_loop(network)
     return [local_lyapunov_exponent(step, flatten(of_episode), num_steps).cpu().numpy() for of_episode in states]
@@ -59,21 +49,9 @@ def flatten(state: HiddenState) -> Tensor:
 
 @torch.no_grad()
 def local_lyapunov_exponent(step: Map, start: Tensor, num_steps: int, num_sweeps: int = 4) -> Tensor:
-    """How fast the perturbation grows that grows most over a few steps.
+    """How fast the perturbation grows that grows most over `num_steps`, in 1/step: (M, S) -> (M,).
 
-    Args:
-        step (`Map`):
-            One step of the system.
-        start (`Tensor`):
-            States to start from, (M, S).
-        num_steps (`int`):
-            Number of steps T.
-        num_sweeps (`int`, *optional*, defaults to `4`):
-            Number of sweeps there and back (subspace iteration); exponents come out too small by an error that falls
-            fast with it.
-
-    Returns:
-        `Tensor`: largest local exponents in 1/step, (M,).
+    Each sweep there and back (subspace iteration) brings the result, which is too small at first, closer.
     """
     frame = _random_frame(start, min(NUM_VECTORS, start.shape[-1]))
     for sweep in range(num_sweeps + 1):

@@ -17,15 +17,8 @@ Curves = Mapping[str, Sequence[np.ndarray]]
 def draw(curves: Curves, phases: Mapping[str, Sequence[int]], num_steps: int, path: Path) -> None:
     """Draws mean and standard deviation over the demonstrations for each model and writes them to `path`.
 
-    Args:
-        curves (`Curves`):
-            The models.
-        phases (`Mapping[str, Sequence[int]]`):
-            Phases of the task and the steps at which they begin in the demonstrations; may be empty.
-        num_steps (`int`):
-            Number of imagined steps, for the label.
-        path (`Path`):
-            Where to write the picture; its ending chooses the format.
+    `phases` has the steps at which phases of the task begin in the demonstrations, and may be empty; `num_steps` is the
+    number of imagined steps.
     """
     with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(7, 3), layout="constrained")

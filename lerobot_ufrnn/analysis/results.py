@@ -105,19 +105,7 @@ def format_rate(successes: int, trials: int) -> str:
 
 
 def wilson_interval(successes: int, trials: int, quantile: float = 1.959963984540054) -> tuple[float, float]:
-    """Wilson score interval of a success rate.
-
-    Args:
-        successes (`int`):
-            Number of successes.
-        trials (`int`):
-            Number of independent trials, at least 1.
-        quantile (`float`, *optional*, defaults to `1.959963984540054`):
-            Quantile of the normal distribution; this one is for 95 %.
-
-    Returns:
-        `tuple[float, float]`: lower and upper bound, from 0 to 1.
-    """
+    """Wilson score interval of a success rate, 95 % by default: lower and upper bound, from 0 to 1."""
     rate, weight = successes / trials, quantile**2 / trials
     centre = rate + weight / 2
     half = math.sqrt(weight * (rate * (1 - rate) + weight / 4))

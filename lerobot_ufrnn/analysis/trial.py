@@ -84,21 +84,7 @@ class TrialHistory:
 
 
 def run_trial(policy: UFRNNPolicy, env: gym.Env, seed: int, film: bool = False) -> TrialHistory:
-    """Runs one trial and keeps what the policy saw, remembered and foresaw.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            Trained policy.
-        env (`gym.Env`):
-            Door environment with a time limit.
-        seed (`int`):
-            Seed of environment and exploration noise.
-        film (`bool`, *optional*, defaults to `False`):
-            Keep pictures of the scene, too.
-
-    Returns:
-        `TrialHistory`: the trial.
-    """
+    """Runs one trial in a door environment with a time limit; `seed` is that of environment and exploration noise."""
     set_seed(seed)
     preprocess, postprocess = make_pre_post_processors(policy.config)
     policy.reset()
@@ -111,7 +97,7 @@ def run_trial(policy: UFRNNPolicy, env: gym.Env, seed: int, film: bool = False) 
     while not done:
         step, before = len(history.states), info
         if film:
-            history.film.append(env.render())
+            history.film.append(np.asarray(env.render()))
         if info["held"]:
             history.held.append(step)
         history.images.append(observation["pixels"][camera])
@@ -127,7 +113,7 @@ def run_trial(policy: UFRNNPolicy, env: gym.Env, seed: int, film: bool = False) 
         for tried in ("attempts", "tried_while_held"):
             history.attempts += [Attempt(step, direction) for direction in info[tried][len(before[tried]) :]]
     if film:
-        history.film.append(env.render())
+        history.film.append(np.asarray(env.render()))
     history.success = bool(info["is_success"])
     return history
 

@@ -39,7 +39,7 @@ def annotate(history: TrialHistory) -> list[Image.Image]:
         draw, upper, lower = ImageDraw.Draw(picture), height + BAR_HEIGHT // 4, height + 3 * BAR_HEIGHT // 4
         draw.text((8, upper), caption, ALARM if "surprised" in caption else WHITE, font, anchor="lm")
         draw.text((width - 8, upper), f"{number / FRAMES_PER_SECOND:.1f} s", WHITE, font, anchor="rm")
-        left = 8
+        left = 8.0
         for way in [direction for step, direction in history.attempts if step < number]:
             right = left + draw.textlength(way, font) + 12
             draw.rectangle((left, lower - 11, right, lower + 11), fill=DOOR_COLORS[way])
@@ -52,15 +52,8 @@ def annotate(history: TrialHistory) -> list[Image.Image]:
 def write_gif(pictures: Sequence[Image.Image], path: Path, every: int = 1, num_colors: int = 128) -> None:
     """Writes an animation that rests at its end, then begins again.
 
-    Args:
-        pictures (`Sequence[Image.Image]`):
-            Its pictures, `FRAMES_PER_SECOND`.
-        path (`Path`):
-            GIF file to write.
-        every (`int`, *optional*, defaults to `1`):
-            Keep each `every`-th picture and the last one: so many times as fast.
-        num_colors (`int`, *optional*, defaults to `128`):
-            Colours of the animation, at most 256. All pictures share them, so that what stands still takes no space.
+    `every` keeps only each so-many-th picture, and the last: so many times as fast. All pictures share `num_colors` (256
+    or fewer), so that what stands still takes no space.
     """
     kept = [*pictures[:-1:every], pictures[-1]]
     sample = np.concatenate([np.asarray(picture) for picture in kept[:: -(-len(kept) // 12)]])

@@ -57,15 +57,7 @@ def run(config: LyapunovConfig) -> None:
 
 
 def phase_starts(provenance: Provenance) -> dict[str, list[int]]:
-    """When the phases of the task begin in recorded demonstrations: the expert plans them once more.
-
-    Args:
-        provenance (`Provenance`):
-            How the demonstrations were recorded.
-
-    Returns:
-        `dict[str, list[int]]`: for each phase the step at which it begins, once for each seed.
-    """
+    """When the phases of the task begin in recorded demonstrations, once a seed: the expert plans them once more."""
     starts: dict[str, list[int]] = {phase: [] for phase in PHASES}
     env = DoorEnv(arm=provenance.settings["arm"], door_offset=provenance.settings["door_offset"])
     try:

@@ -43,37 +43,18 @@ class DoorTrialConfig:
 def run_door_trial(
     policy: UFRNNPolicy, config: DoorTrialConfig, kind: str, film: bool = False, **options: Any
 ) -> TrialHistory:
-    """Runs one trial with a door.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            Trained policy.
-        config (`DoorTrialConfig`):
-            Which trial.
-        kind (`str`):
-            Kind of the door, in place of the configuration's.
-        film (`bool`, *optional*, defaults to `False`):
-            Keep a picture of each step.
-        **options (`Any`):
-            Further options of [`~env_door.env.DoorEnv`].
-
-    Returns:
-        `TrialHistory`: the trial.
-    """
-    settings = {"max_episode_steps": config.num_steps, "arm": config.arm, "door_offset": config.door_offset}
+    """Runs one trial with a door of this kind; further options are those of [`~env_door.env.DoorEnv`]."""
+    settings: dict[str, Any] = {
+        "max_episode_steps": config.num_steps,
+        "arm": config.arm,
+        "door_offset": config.door_offset,
+    }
     with closing(gym.make("env_door/Door-v0", kind=kind, **settings, **options)) as env:
         return run_trial(policy, env, config.seed, film)
 
 
 def load_policy(path: str) -> UFRNNPolicy:
-    """Loads a policy with the reference kernel, which keeps what it imagines and needs no compiling.
-
-    Args:
-        path (`str`):
-            Checkpoint folder or Hub repository of a `ufrnn` policy.
-
-    Returns:
-        `UFRNNPolicy`: the policy.
+    """Loads a `ufrnn` policy with the reference kernel, which keeps what it imagines and needs no compiling.
 
     Raises:
         ValueError: If the policy is of another type.
@@ -86,16 +67,16 @@ def load_policy(path: str) -> UFRNNPolicy:
 
 
 def load_policies(paths: Sequence[str], labels: Sequence[str]) -> dict[str, UFRNNPolicy]:
-    """Loads policies to compare.
+    """Loads policies to compare, by name.
 
     Args:
         paths (`Sequence[str]`):
-            See `load_policy`.
+            Checkpoint folders or Hub repositories.
         labels (`Sequence[str]`):
             Their names; when empty, what the paper calls a policy with such exploration.
 
     Returns:
-        `dict[str, UFRNNPolicy]`: the policies by name, in order.
+        `dict[str, UFRNNPolicy]`: the policies, in order.
 
     Raises:
         ValueError: If there is no policy, one is of another type, or they cannot be told apart by their names.

@@ -1,5 +1,4 @@
 import json
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -30,18 +29,17 @@ def test_help_of_all_commands_imports_none_of_them():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_a_command_names_it_and_explains_every_flag(command, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "400")  # a flag and its text on one line
+def test_help_of_a_command_names_it_and_explains_every_flag(command, capsys):
     with pytest.raises(SystemExit) as ended:
         main([command, "--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
     assert text.startswith(f"usage: ufrnn {command} [-h]")
-    flags = re.findall(r"^  --([\w.]+) +\S+(.*)$", text, re.MULTILINE)
+    flags = [block.split("\n\n")[0] for block in text.split("\n  --")[1:]]
     assert len(flags) > 1
-    for flag, explanation in flags:
-        if not flag.startswith("rgb_encoder"):  # LeRobot's own
-            assert len(explanation.split("(default:")[0].split()) >= 2, f"--{flag}: {explanation!r}"
+    for flag in flags:
+        name, _, *explanation = flag.split("(default:")[0].split()
+        assert len(explanation) > 1 or name.startswith("rgb_encoder."), f"--{flag}"  # those are LeRobot's
 
 
 def test_an_unknown_command_is_refused(capsys):
