@@ -52,8 +52,8 @@ def annotate(history: TrialHistory) -> list[Image.Image]:
 def write_gif(pictures: Sequence[Image.Image], path: Path, every: int = 1, num_colors: int = 128) -> None:
     """Writes an animation that rests at its end, then begins again.
 
-    `every` keeps only each so-many-th picture, and the last: so many times as fast. All pictures share `num_colors` (256
-    or fewer), so that what stands still takes no space.
+    `every` keeps only each so-many-th picture, and the last: so many times as fast. All pictures share `num_colors`, so
+    that what stands still takes no space.
     """
     kept = [*pictures[:-1:every], pictures[-1]]
     sample = np.concatenate([np.asarray(picture) for picture in kept[:: -(-len(kept) // 12)]])
