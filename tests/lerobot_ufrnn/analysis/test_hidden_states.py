@@ -1,21 +1,15 @@
-import csv
-from io import StringIO
-
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from lerobot.policies.factory import make_policy
-from oracle import Oracle
 from sklearn.decomposition import PCA
 from small import batch_of, small_config, train
-from small_network import in_closed_loop, row_of
 
 from lerobot_ufrnn.analysis import hidden_picture, lyapunov_picture
-from lerobot_ufrnn.analysis.drift import imagined_drift
 from lerobot_ufrnn.analysis.hidden_picture import HiddenPaths
 from lerobot_ufrnn.analysis.hidden_states import Plane, read_demonstrations, states_along
 from lerobot_ufrnn.analysis.lyapunov import exponents_over_time
-from lerobot_ufrnn.analysis.lyapunov_picture import ExponentCurves
 from lerobot_ufrnn.analysis.trial import Attempt, TrialHistory
 from lerobot_ufrnn.networks import HiddenState
 
@@ -49,23 +43,6 @@ def test_states_are_found_along_demonstrations_of_any_length(uneven_dataset, exp
         torch.testing.assert_close(states[2], alone)
 
 
-def test_drift_is_the_mean_distance_of_imagined_poses_from_the_nearest_demonstrated_one(uneven_dataset):
-    policy = make_policy(small_config(exploration="none"), ds_meta=uneven_dataset.meta)
-    train(policy, [batch_of(0, 1, 2)] * 3)
-    policy.eval()
-    demonstrations = read_demonstrations(policy, uneven_dataset.root)
-    poses = torch.cat([policy.joint_scaler.scale(episode.states) for episode in demonstrations]).numpy()
-    network = policy.model.network
-    for states, drift in zip(
-        states_along(policy, demonstrations), imagined_drift(policy, demonstrations, 4), strict=True
-    ):
-        for start in range(len(drift)):
-            imagined = in_closed_loop(network, row_of(states, start), 4)
-            means = [Oracle(network).predict(state)[0][: network.joint_dim] for state in imagined]
-            nearest = [min(np.linalg.norm(mean - pose) for pose in poses) for mean in means]
-            assert drift[start] == pytest.approx(np.mean(nearest), abs=1e-5)
-
-
 def test_a_folder_without_a_dataset_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no meta/info\.json"):
         read_demonstrations(None, tmp_path)
@@ -90,24 +67,30 @@ def test_hidden_states_are_drawn_and_written(held, tmp_path):
     models = [some_paths("first", held), some_paths("second", [])]
     hidden_picture.draw(models, tmp_path / "folder" / "hidden.png")
     assert (tmp_path / "folder" / "hidden.png").read_bytes().startswith(b"\x89PNG")
-    rows = list(csv.DictReader(StringIO(hidden_picture.to_csv(models))))
-    assert len(rows) == 2 * (9 + 7 + 8)
-    assert [(row["path"], row["kind"], row["step"], row["tried"]) for row in rows if row["tried"]] == [
-        ("trial", "pull", "3", "push"),
-        ("trial", "pull", "5", "pull"),
-    ] * 2
-    assert [int(row["step"]) for row in rows if row["held"] == "1"] == held
+    table = hidden_picture.to_table(models)
+    assert table.columns.tolist() == ["model", "path", "kind", "step", "pc1", "pc2", "tried", "held"]
+    assert len(table) == 2 * (9 + 7 + 8)
+    tried = table[table["tried"] != ""][["path", "kind", "step", "tried"]]
+    assert tried.to_numpy().tolist() == [["trial", "pull", 3, "push"], ["trial", "pull", 5, "pull"]] * 2
+    assert table["step"][table["held"] == 1].tolist() == held
+    trial = table[(table["model"] == "second") & (table["path"] == "trial")]
+    np.testing.assert_array_equal(trial[["pc1", "pc2"]], models[1].trial)
 
 
 def test_exponents_are_drawn_and_written(tmp_path):
-    curves = [ExponentCurves("model", [np.array([0.1, 0.2]), np.array([0.3, 0.4, 0.5])])]
-    mean, deviation = curves[0].statistics
+    curves = {"model": [np.array([0.1, 0.2]), np.array([0.3, 0.4, 0.5])]}
+    mean, deviation = lyapunov_picture.statistics(curves["model"])
     np.testing.assert_allclose(mean, [0.2, 0.3, 0.5])
     np.testing.assert_allclose(deviation, [0.1, 0.1, 0.0], atol=1e-12)
     for phases in ({}, {"grasp": [0, 1]}):
         lyapunov_picture.draw(curves, phases, 10, tmp_path / "folder" / "lyapunov.png")
     assert (tmp_path / "folder" / "lyapunov.png").read_bytes().startswith(b"\x89PNG")
-    assert lyapunov_picture.to_csv(curves).splitlines()[:2] == [
-        "model,demonstration,step,exponent",
-        "model,0,0,0.10000",
-    ]
+    expected = pd.DataFrame(
+        {
+            "model": "model",
+            "demonstration": [0, 0, 1, 1, 1],
+            "step": [0, 1, 0, 1, 2],
+            "exponent": [0.1, 0.2, 0.3, 0.4, 0.5],
+        }
+    )
+    pd.testing.assert_frame_equal(lyapunov_picture.to_table(curves), expected)

@@ -6,7 +6,7 @@ from lerobot.policies.factory import make_policy
 from small import JOINTS, batch_of, small_config, train
 
 from lerobot_ufrnn.analysis.hidden_states import read_demonstrations, states_along
-from lerobot_ufrnn.analysis.trial import Attempt, run_trial
+from lerobot_ufrnn.analysis.trial import Attempt, TrialHistory, run_trial
 
 
 class Playback(gym.Env):
@@ -42,6 +42,9 @@ class Playback(gym.Env):
         image = (frame["observation.images.front"].permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
         return {"pixels": {"front": image}, "agent_pos": frame["observation.state"].numpy()}
 
+    def render(self):
+        return np.full((8, 8, 3), self.step_count, dtype=np.uint8)
+
     def info(self):
         return {
             "door_kind": "pull",
@@ -61,7 +64,7 @@ def trained(dataset, exploration: str, **overrides):
 
 @pytest.mark.parametrize("exploration", ["none", "foresight"])
 def test_a_trial_is_kept_step_by_step(dataset, exploration):
-    policy = trained(dataset, exploration, recall=False, kernel="reference")
+    policy = trained(dataset, exploration, recall={"enabled": False}, kernel="reference")
     history = run_trial(policy, Playback(dataset, {4: "push", 7: "pull"}), seed=0)
     assert history.attempts == [Attempt(4, "push"), Attempt(7, "pull")]
     assert (history.door_kind, history.first_try, history.success) == ("pull", 4, True)
@@ -73,26 +76,43 @@ def test_a_trial_is_kept_step_by_step(dataset, exploration):
 
 
 def test_with_recall_what_is_imagined_is_kept_of_the_steps_that_surprised(dataset):
-    policy = trained(dataset, "foresight", recall_horizon=9, recall_commitment=4)
-    policy.recall.threshold = 0.01  # so little trained, it expects to be wrong
+    policy = trained(dataset, "foresight", recall={"horizon": 9, "commitment": 4})
+    policy.recall.config.surprise_threshold = 0.01  # so little trained, it expects to be wrong
     history = run_trial(policy, Playback(dataset, {}), seed=0)
     events = policy.recall.events[0]
     assert events
-    assert [imagined.step for imagined in history.imaginations] == [event.step for event in events]
+    assert [imagined.step for imagined in history.imaginations] == [event.step for event in events] == history.returns
     for imagined, event in zip(history.imaginations, events, strict=True):
-        assert imagined.futures.mean.shape[:2] == (9, policy.config.recall_samples)
+        assert imagined.futures.mean.shape[:2] == (9, policy.config.recall.num_samples)
         assert imagined.chosen == event.chosen
+
+
+def test_a_film_shows_the_scene_before_the_first_step_and_after_each(dataset):
+    history = run_trial(trained(dataset, "none"), Playback(dataset, {}), seed=0, film=True)
+    assert [picture[0, 0, 0] for picture in history.film] == list(range(13))
 
 
 def test_the_steps_of_a_hold_and_the_tries_meanwhile_are_kept(dataset):
     door = Playback(dataset, {2: "pull", 5: "push", 9: "pull"}, held=range(4, 8))
     history = run_trial(trained(dataset, "none"), door, seed=0)
     assert history.held == [4, 5, 6, 7]
+    assert not history.film
     assert history.attempts == [Attempt(2, "pull"), Attempt(5, "push"), Attempt(9, "pull")]
 
 
-def test_a_trial_without_a_try_has_no_first_try(dataset):
-    assert run_trial(trained(dataset, "none"), Playback(dataset, {}), seed=0).first_try is None
+@pytest.mark.parametrize(
+    ("attempts", "success", "first_try", "recovered"),
+    [
+        ([], False, None, False),
+        (["pull"], True, 0, False),
+        (["push", "pull"], True, 0, True),
+        (["push", "pull"], False, 0, False),
+    ],
+)
+def test_a_recovery_opens_a_door_after_a_wrong_try(attempts, success, first_try, recovered):
+    tries = [Attempt(step, way) for step, way in enumerate(attempts)]
+    history = TrialHistory("pull", (), attempts=tries, success=success)
+    assert (history.first_try, history.recovered) == (first_try, recovered)
 
 
 def test_reading_a_demonstration_and_living_it_lead_to_the_same_states(dataset):
