@@ -1,47 +1,50 @@
-"""A picture of success over the epochs of training, door by door."""
+"""How does success rise over the epochs of training, door by door? Draws experiments/results/success_curve.png.
 
-from collections.abc import Sequence
+python experiments/curve.py
+"""
+
+import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
-import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
+from tables import RESULTS, SUCCESS_COUNTS, read_table
 
-from .colors import DOOR_COLORS
-from .evaluation_table import ProtocolRow, total
+from lerobot_ufrnn.analysis.colors import DOOR_COLORS
+from lerobot_ufrnn.commands.flags import parse_flags
 
 PANELS_PER_ROW = 3
 
 
-def draw(rows: Sequence[ProtocolRow], path: Path) -> None:
-    """Draws a panel a model and writes them to `path`.
+@dataclass
+class CurveConfig:
+    """What to draw."""
 
-    The stacked areas are the doors of each kind that were opened within 30 s, as a share of all trials and pooled over
-    training seeds, so that their upper edge is the success rate. Each thin line is the success rate of one seed. Where
-    there are models with several evaluated epochs, those with a single one are left out.
+    results: Path = RESULTS / "door_protocol.csv"
+    """Table that `sweep.py` wrote."""
+    output: Path = RESULTS / "success_curve.png"
+    """Picture to write."""
 
-    Args:
-        rows (`Sequence[ProtocolRow]`):
-            The table.
-        path (`Path`):
-            Where to write the picture; its ending chooses the format.
 
-    Raises:
-        ValueError: If the table is empty.
+def draw(table: pd.DataFrame, path: Path) -> None:
+    """Draws a panel a model. Where there are models with several epochs, those with a single one are left out.
+
+    The stacked areas are the doors of each kind that were opened within 30 s, as a share of all trials of all networks,
+    so that their upper edge is the success rate. Each thin line is the success rate of one network.
     """
-    epochs = {model: {row.epoch for row in rows if row.model == model} for model in {row.model for row in rows}}
-    models = sorted(model for model in epochs if len(epochs[model]) > 1) or sorted(epochs)
-    if not models:
-        raise ValueError("There are no results to draw: the table is empty. `ufrnn protocol` fills it.")
+    epochs = table.groupby("model").epoch.nunique()
+    models = list(epochs[epochs > 1].index) or list(epochs.index)
     num_columns = min(len(models), PANELS_PER_ROW)
     num_rows = -(-len(models) // num_columns)
     with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(1 + 2.9 * num_columns, 0.6 + 2.6 * num_rows), layout="constrained")
         panels = figure.subplots(num_rows, num_columns, sharey=True, squeeze=False).flatten()
         for panel, model in zip(panels, models, strict=False):
-            _draw_model(panel, [row for row in rows if row.model == model])
+            _draw_model(panel, table[table.model == model])
             panel.set_title(model, fontsize=10, parse_math=False)
         for panel in panels[len(models) :]:
             panel.set_visible(False)
@@ -54,40 +57,47 @@ def draw(rows: Sequence[ProtocolRow], path: Path) -> None:
         figure.savefig(path, dpi=150)
 
 
-def _draw_model(panel: Axes, rows: Sequence[ProtocolRow]) -> None:
-    epochs = sorted({row.epoch for row in rows})
-    at_epoch = [[row for row in rows if row.epoch == epoch] for epoch in epochs]
-    kinds = [kind for kind in DOOR_COLORS if kind in {row.kind for row in rows}]
-    shares = np.array([
-        [total([row for row in at if row.kind == kind], "opened_300") / total(at, "trials") for at in at_epoch]
-        for kind in kinds
-    ])  # (kinds, epochs)  # fmt: skip
-    # One epoch has no width to fill: it becomes a bar.
-    x = epochs if len(epochs) > 1 else [epochs[0] - 0.4, epochs[0] + 0.4]
-    stacks = panel.stackplot(x, np.broadcast_to(shares, (len(kinds), len(x))), labels=kinds, linewidth=0)
-    for stack, kind in zip(stacks, kinds, strict=True):
-        stack.set_facecolor(DOOR_COLORS[kind])
-    for number, seed in enumerate(sorted({row.train_seed for row in rows})):
-        of_seed = [[row for row in at if row.train_seed == seed] for at in at_epoch]
-        points = [
-            (epoch, total(at, "opened_300") / total(at, "trials"))
-            for epoch, at in zip(epochs, of_seed, strict=True)
-            if at
-        ]
+def _draw_model(panel: Axes, table: pd.DataFrame) -> None:
+    counts = table.pivot_table(index="epoch", columns="kind", values=["opened_300", "trials"], aggfunc="sum")
+    kinds = [kind for kind in DOOR_COLORS if kind in set(table.kind)]
+    shares = counts.opened_300[kinds].div(counts.trials.sum(axis=1), axis=0)  # (epochs, kinds)
+    single = len(shares) == 1
+    if single:  # one epoch has no width to fill: it becomes a bar
+        epoch = shares.index[0]
+        shares = pd.concat([shares.set_axis([epoch - 0.4]), shares.set_axis([epoch + 0.4])])
+    colors = [DOOR_COLORS[kind] for kind in kinds]
+    panel.stackplot(shares.index, shares.T, labels=kinds, colors=colors, linewidth=0)
+    networks = table.groupby(["train_seed", "epoch"])[["opened_300", "trials"]].sum()
+    for number, (_, network) in enumerate(networks.groupby("train_seed")):
         panel.plot(
-            *zip(*points, strict=True),
+            network.index.get_level_values("epoch"),
+            network.opened_300 / network.trials,
             color="black",
             linewidth=0.6,
             clip_on=False,
             marker="o",
-            markersize=3 if len(epochs) == 1 else 1,
+            markersize=3 if single else 1,
             label="each training seed" if number == 0 else None,
         )
-    panel.set(ylim=(0, 1), xlim=(0, x[-1]) if len(epochs) > 1 else (x[0] - 0.6, x[-1] + 0.6))
+    panel.set(ylim=(0, 1), xlim=(shares.index[0] - 0.2, shares.index[-1] + 0.2) if single else (0, shares.index[-1]))
     panel.grid(axis="y", color="0.9", linewidth=0.6)
     panel.set_axisbelow(True)
     panel.yaxis.set_major_formatter(PercentFormatter(1))
-    if len(epochs) == 1:
-        panel.set_xticks(epochs)
+    if single:
+        panel.set_xticks(table.epoch.unique())
     else:
         panel.xaxis.set_major_locator(MaxNLocator(3, integer=True, steps=[1, 2, 5, 10]))
+
+
+def main(arguments: list[str]) -> None:
+    """Writes the picture."""
+    config = parse_flags(CurveConfig, arguments)
+    draw(read_table(config.results, SUCCESS_COUNTS), config.output)
+    print(f"Success over epochs: {config.output}")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except (ValueError, OSError) as error:
+        sys.exit(f"curve.py: {error}")
