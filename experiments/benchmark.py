@@ -311,7 +311,9 @@ def quick_figures(seconds: float = 4.0, rounds: int = 10, **problem) -> dict[str
 
 def main(arguments: list[str]) -> None:
     """Measures, prints and writes."""
-    config = parse_flags(BenchmarkConfig, ["--quick=true" if word == "--quick" else word for word in arguments])
+    config = parse_flags(
+        BenchmarkConfig, ["--quick=true" if word == "--quick" else word for word in arguments], "benchmark.py"
+    )
     if config.quick:
         print(", ".join(f"{name} {value}" for name, value in describe_machine().items()), flush=True)
         print(json.dumps(quick_figures()), flush=True)

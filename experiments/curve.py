@@ -91,7 +91,7 @@ def _draw_model(panel: Axes, table: pd.DataFrame) -> None:
 
 def main(arguments: list[str]) -> None:
     """Writes the picture."""
-    config = parse_flags(CurveConfig, arguments)
+    config = parse_flags(CurveConfig, arguments, "curve.py")
     draw(read_table(config.results, SUCCESS_COUNTS), config.output)
     print(f"Success over epochs: {config.output}")
 

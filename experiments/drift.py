@@ -71,7 +71,7 @@ def imagined_drift(policy: UFRNNPolicy, demonstrations: Sequence[Episode], num_s
 
 def main(arguments: list[str]) -> None:
     """Prints a table: a row for each policy."""
-    config = parse_flags(DriftConfig, arguments)
+    config = parse_flags(DriftConfig, arguments, "drift.py")
     print(
         f"Distance of {config.horizon} imagined steps from the nearest demonstrated pose in scaled units (0.8 is half\n"
         "the range of a joint): mean, and 95th percentile over where imagining starts.\n\n"

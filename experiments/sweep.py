@@ -19,23 +19,23 @@ import string
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from draccus.utils import ParsingError
+from env_door.limits import MAX_HOLD, MAX_OFFSET
 from epochs import Model, Schedule, read_model
 from jobs import locked, replace_text, run_command, stop
 from tables import HELD_COUNTS, KEY, RESULTS, SUCCESS_COUNTS, describe, read_table
 
 from env_door.checks import check_range
-from env_door.env import MAX_HOLD, MAX_OFFSET
 from env_door.latch import KINDS, check_kinds
 from env_door.provenance import PROVENANCE_PATH
 from env_door.trials import first_of_each_kind, read_trials
-from lerobot_ufrnn.analysis.results import summarize as count_by_door
+from lerobot_ufrnn.analysis.results import count_by_door
 from lerobot_ufrnn.commands.flags import parse_flags
 
 # Nothing here imports LeRobot or PyTorch: their memory would lie idle while the commands need it.
@@ -272,8 +272,7 @@ class Network:
             run_command("lerobot-eval", flags=flags, log=log.parent.with_suffix(".log"), lock=lock)
             if missing := self.missing_trials(epoch):
                 raise RuntimeError(f"{log} lacks {len(missing)} trials, such as {min(missing)}.")
-        doors = count_by_door(first_of_each_kind(read_trials(log), config.trials_per_kind))
-        rows = pd.DataFrame([asdict(door) for door in doors if door.kind != "all"])
+        rows = count_by_door(first_of_each_kind(read_trials(log), config.trials_per_kind)).drop("all").reset_index()
         label = f"{self.model.name}+{config.variant}" if config.variant else self.model.name
         rows = rows.assign(model=label, train_seed=self.seed, epoch=epoch)
         add_to_table(config.table, rows[[*KEY, *config.counts]])
@@ -343,7 +342,7 @@ def _attempt(name: str, work: Callable[[], None]) -> bool:
 
 def main(arguments: list[str]) -> None:
     """Does what is not done yet, and prints the table; a RuntimeError if something failed, with the rest done."""
-    config = parse_flags(SweepConfig, arguments)
+    config = parse_flags(SweepConfig, arguments, "sweep.py")
     if config.table.exists():
         read_table(config.table, config.counts)  # refuses another kind of table before the work
     models = [read_model(path) for path in config.models]

@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from lerobot_ufrnn.analysis.results import markdown
 from lerobot_ufrnn.commands.flags import parse_flags
 
 RESULTS = Path(__file__).parent / "results"
@@ -165,7 +166,7 @@ def summarize_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> p
     rates = rates_of_networks(table, by)
     groups = rates.groupby(list(by))
     first = next(iter(rates))
-    summary = groups[first].apply(lambda each: ", ".join(f"{rate:.0f}" for rate in each)).to_frame(f"{first}: each")
+    summary = groups[first].apply(lambda each: ", ".join(map(_number, each))).to_frame(f"{first}: each")
     for name in rates:
         summary[f"{name}: mean" if name == first else name] = groups[name].apply(
             lambda each: _text(each.mean(), interval(list(each.dropna())))
@@ -192,18 +193,12 @@ def differences(table: pd.DataFrame) -> pd.DataFrame:
             name: _text(
                 rates[name].mean() - of_other[name].mean(),
                 interval_of_difference(rates[name].dropna(), of_other[name].dropna(), paired),
-                "+.0f",
+                "+",
             )
             for name in rates
         }
         rows.append({"difference": f"{model} - {other}", **cells})
     return pd.DataFrame(rows)
-
-
-def to_markdown(table: pd.DataFrame) -> str:
-    """The cells as they are between bars (pandas needs another package for that)."""
-    lines = [list(table), ["---"] * table.shape[1], *table.astype(str).to_numpy()]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def describe(table: pd.DataFrame) -> str:
@@ -213,13 +208,18 @@ def describe(table: pd.DataFrame) -> str:
         "Differences in percentage points [95 % over networks]": differences(table),
         "Door by door": summarize_networks(table, ("model", "kind")),
     }
-    return "\n\n".join(f"{title}:\n\n{to_markdown(rows)}" for title, rows in sections.items() if not rows.empty)
+    return "\n".join(f"{title}:\n\n{markdown(rows)}" for title, rows in sections.items() if not rows.empty)
 
 
-def _text(value: float, bounds: tuple[float, float] | None, style: str = ".0f") -> str:
+def _text(value: float, bounds: tuple[float, float] | None, sign: str = "") -> str:
     if math.isnan(value):  # a rate of nothing
         return "-"
-    return f"{value:{style}}" + (f" [{bounds[0]:{style}}, {bounds[1]:{style}}]" if bounds else "")
+    return _number(value, sign) + (f" [{', '.join(_number(bound, sign) for bound in bounds)}]" if bounds else "")
+
+
+def _number(value: float, sign: str = "") -> str:
+    # With a digit more where rounding would make a failure or a success disappear.
+    return f"{value:{sign}.{1 if 0 < abs(value) < 0.5 or 99.5 <= abs(value) < 100 else 0}f}"
 
 
 def _refuse(path: Path, wrong: pd.Series, problem: str) -> None:
@@ -229,7 +229,7 @@ def _refuse(path: Path, wrong: pd.Series, problem: str) -> None:
 
 def main(arguments: list[str]) -> None:
     """Prints the tables."""
-    for path in parse_flags(TablesConfig, arguments).results:
+    for path in parse_flags(TablesConfig, arguments, "tables.py").results:
         print(f"## {path.name}\n\n{describe(read_table(path))}\n")
 
 

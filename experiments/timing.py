@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from tables import to_markdown
+
+from lerobot_ufrnn.analysis.results import markdown
 
 PACKAGES = ("torch", "numba", "jax", "diffusers", "lerobot", "mujoco", "numpy")
 
@@ -87,7 +88,7 @@ def write(name: str, note: str | None, table: pd.DataFrame, output_dir: Path) ->
     """Prints a table, and writes `<name>.md` to read and `<name>.json` to compute with."""
     machine = describe_machine()
     page = f"# Benchmark: {name}\n\n{', '.join(f'{key} {value}' for key, value in machine.items())}\n\n"
-    page += f"{' '.join((note or '').split())} Medians with [10th, 90th percentile].\n\n{to_markdown(table)}\n"
+    page += f"{' '.join((note or '').split())} Medians with [10th, 90th percentile].\n\n{markdown(table)}"
     output_dir.mkdir(parents=True, exist_ok=True)
     (output_dir / f"{name}.md").write_text(page)
     content = {"machine": machine, "table": table.to_dict("records")}
