@@ -33,12 +33,12 @@ from tables import HELD_COUNTS, KEY, RESULTS, SUCCESS_COUNTS, describe, read_tab
 
 from env_door.checks import check_range
 from env_door.latch import KINDS, check_kinds
-from env_door.provenance import PROVENANCE_PATH
 from env_door.trials import first_of_each_kind, read_trials
 from lerobot_ufrnn.analysis.results import count_by_door
 from lerobot_ufrnn.commands.flags import parse_flags
 
 # Nothing here imports LeRobot or PyTorch: their memory would lie idle while the commands need it.
+PROVENANCE_PATH = Path("meta/door_recording.json")  # where the recorder keeps its settings; it imports LeRobot
 EVALUATION_BATCH_SIZE = 10
 REPO_ID = "ufrnn/door"
 NAME_CHARACTERS = set(string.ascii_letters + string.digits + "_-")
@@ -209,8 +209,10 @@ class Network:
 
         LeRobot points the link `last` at a checkpoint once it is written; it takes the old link away just before.
         """
-        link = self.folder / "train" / "checkpoints" / "last"
-        return int(link.readlink().name) if link.is_symlink() else max([0, *list(self.checkpoints)[:-1]])
+        link, steps = self.folder / "train" / "checkpoints" / "last", list(self.checkpoints)
+        if link.is_symlink():
+            return int(link.readlink().name)
+        return steps[-1] if len(steps) > 1 else 0
 
     def trial_log(self, epoch: int) -> Path:
         """Trials of an epoch's checkpoint."""
