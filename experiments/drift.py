@@ -45,20 +45,10 @@ class DriftConfig:
 
 @torch.no_grad()
 def imagined_drift(policy: UFRNNPolicy, demonstrations: Sequence[Episode], num_steps: int) -> list[Tensor]:
-    """Mean distance of imagined poses from the nearest demonstrated one.
+    """Mean distance of T imagined poses from the nearest demonstrated one, (L,) for the L steps of each demonstration.
 
-    Args:
-        policy (`UFRNNPolicy`):
-            Reads the demonstrations, exploring as when it acts, and imagines from each of their steps; imagining
-            itself adds no noise.
-        demonstrations (`Sequence[Episode]`):
-            All their poses count as demonstrated.
-        num_steps (`int`):
-            Number T of imagined steps.
-
-    Returns:
-        `list[Tensor]`: for each demonstration and each of its steps as a start the distance, (L,), in units of the
-            scaled joints, which were demonstrated between -0.8 and 0.8.
+    The policy reads the demonstrations, exploring as when it acts, and imagines from each of their steps without noise.
+    Units are those of the scaled joints, which were demonstrated between -0.8 and 0.8.
     """
     poses = [policy.joint_scaler.scale(episode.states.to(policy.updates.device)) for episode in demonstrations]
     demonstrated, joint_dim = torch.cat(poses), policy.model.network.joint_dim

@@ -349,16 +349,13 @@ def main(arguments: list[str]) -> None:
         read_table(config.table, config.counts)  # refuses another kind of table before the work
     models = [read_model(path) for path in config.models]
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # `kill` ends the commands as Ctrl-C does
+    pool = ThreadPoolExecutor(config.workers)
     try:
         record_missing(config)
-        with ThreadPoolExecutor(config.workers) as pool:
-            try:
-                failures = [name for failed in pool.map(Network.run, plan(config, models)) for name in failed]
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                stop()
-                raise
-    except KeyboardInterrupt:
+        futures = [pool.submit(network.run) for network in plan(config, models)]
+        failures = [name for future in futures for name in future.result()]
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
         stop()
         raise
     if config.table.exists():

@@ -43,32 +43,14 @@ Rates = dict[str, tuple[str, str]]
 
 @dataclass
 class TablesConfig:
-    """What to print.
-
-    Args:
-        results (`list[Path]`, *optional*, defaults to all of `experiments/results/*.csv`):
-            Tables that `sweep.py` wrote.
-    """
+    """What to print."""
 
     results: list[Path] = field(default_factory=lambda: sorted(RESULTS.glob("*.csv")))
+    """Tables that `sweep.py` wrote; all of `experiments/results` when not given."""
 
 
 def read_table(path: Path, counts: Sequence[str] | None = None) -> pd.DataFrame:
-    """Reads a table of counts.
-
-    Args:
-        path (`Path`):
-            CSV file of `sweep.py`.
-        counts (`Sequence[str]`, *optional*):
-            Its columns behind `KEY`; either kind of table when not given.
-
-    Returns:
-        `pd.DataFrame`: one row or more.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is another kind of table, is empty, repeats a row, or counts more of a part than of the whole.
-    """
+    """Reads a table with these columns behind `KEY`, either kind when not given; refuses one whose counts cannot be."""
     if not path.exists():
         raise FileNotFoundError(f"There is no table of results at '{path}'; `python experiments/sweep.py` makes one.")
     allowed = [SUCCESS_COUNTS, HELD_COUNTS] if counts is None else [list(counts)]
@@ -98,22 +80,10 @@ def rates_of(table: pd.DataFrame) -> Rates:
 
 
 def rates_of_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> pd.DataFrame:
-    """Rates in percent of each network at its model's last epoch.
-
-    Args:
-        table (`pd.DataFrame`):
-            See `read_table`.
-        by (`Sequence[str]`, *optional*, defaults to `("model",)`):
-            Columns that tell rows apart; `("model", "kind")` for each kind of door on its own.
-
-    Returns:
-        `pd.DataFrame`: a row for each of `by` and training seed, a column for each rate; NaN where there is no whole.
-    """
+    """Rates in percent of each network at its model's last epoch, a row for each of `by` and seed; NaN of nothing."""
     last = table[table.epoch == table.groupby("model").epoch.transform("max")]
     counts = last.groupby([*by, "train_seed"]).sum(numeric_only=True)
-    return pd.DataFrame(
-        {name: 100 * counts[part] / counts[whole] for name, (part, whole) in rates_of(table).items()}
-    )  # 0 of 0 is NaN
+    return pd.DataFrame({name: 100 * counts[part] / counts[whole] for name, (part, whole) in rates_of(table).items()})
 
 
 def interval(rates: Sequence[float]) -> tuple[float, float] | None:
@@ -125,18 +95,9 @@ def interval(rates: Sequence[float]) -> tuple[float, float] | None:
 
 
 def interval_of_difference(rates: pd.Series, others: pd.Series, paired: bool) -> tuple[float, float] | None:
-    """95 % interval of the difference of two means over networks in percentage points.
+    """95 % interval of the difference of two means over networks in percentage points; None where there is no spread.
 
-    Args:
-        rates (`pd.Series`):
-            Rates in percent by training seed.
-        others (`pd.Series`):
-            Those to subtract.
-        paired (`bool`):
-            Whether networks of the same training seed are the same networks, acting in another way; otherwise Welch's.
-
-    Returns:
-        `tuple[float, float] | None`: its bounds; None where there is no spread to judge by.
+    `paired` if networks of the same seed are the same networks that act in another way; otherwise it is Welch's.
     """
     if paired:
         gaps = (rates - others).dropna()
@@ -152,17 +113,7 @@ def interval_of_difference(rates: pd.Series, others: pd.Series, paired: bool) ->
 
 
 def summarize_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> pd.DataFrame:
-    """What people read: the first rate of each network, then each rate over networks.
-
-    Args:
-        table (`pd.DataFrame`):
-            See `read_table`.
-        by (`Sequence[str]`, *optional*, defaults to `("model",)`):
-            Columns that tell rows apart.
-
-    Returns:
-        `pd.DataFrame`: cells of text such as `83 [53, 100]`, in percent.
-    """
+    """Cells of text such as `83 [53, 100]`: the first rate of each network, then each over networks, in percent."""
     rates = rates_of_networks(table, by)
     groups = rates.groupby(list(by))
     first = next(iter(rates))
