@@ -1,4 +1,4 @@
-"""The competitor: UF-RNN's training update as one XLA program, with `lax.scan` over time (JAX).
+"""The competitor of benchmark.py: UF-RNN's training update as one XLA program, with `lax.scan` over time (JAX).
 
 Written to be as fast as we could make XLA on one CPU thread. Measured at the paper's sizes:
 
@@ -22,6 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
+
 # Read when JAX first computes. On one CPU, threads that share the work or start it only cost time.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false".strip()
 jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -32,15 +34,7 @@ ADAM_BETAS, ADAM_EPSILON = (0.9, 0.999), 1e-8
 
 
 class ScanSizes(NamedTuple):
-    """What must be known when compiling.
-
-    Attributes:
-        joint_dim (`int`), feature_dim (`int`): dimensions of the inputs.
-        joint_hidden (`int`), image_hidden (`int`), shared_hidden (`int`): hidden sizes.
-        horizon (`int`): imagined steps T.
-        log_variance_range (`tuple`): bounds of the log-variances.
-        noise_range (`tuple`): standard deviation of the noise at the least and the most uncertain moment.
-    """
+    """What must be known when compiling."""
 
     joint_dim: int
     feature_dim: int
@@ -50,6 +44,13 @@ class ScanSizes(NamedTuple):
     horizon: int
     log_variance_range: tuple[float, float]
     noise_range: tuple[float, float]
+
+    @classmethod
+    def of(cls, config: UFRNNConfig) -> "ScanSizes":
+        """Those of a configuration with its features filled in."""
+        hidden = config.joint_hidden_dim, config.image_hidden_dim, config.shared_hidden_dim
+        foresight, bounds = config.foresight, config.log_variance_range
+        return cls(config.joint_dim, config.image_dim, *hidden, foresight.horizon, bounds, foresight.noise_range)
 
 
 class _Packed(NamedTuple):
@@ -144,24 +145,10 @@ def loss(
     noise_bounds: jax.Array,
     sizes: ScanSizes,
 ) -> tuple[jax.Array, jax.Array]:
-    """Mean Gaussian NLL of the sensor values and the commands of whole episodes.
+    """Mean Gaussian NLL of the sensor values and the commands of whole episodes, and the chosen candidates (L, B).
 
-    Args:
-        parameters (`Parameters`):
-            Parameters under the names of `SHLSTM`.
-        inputs (`jax.Array`), targets (`jax.Array`):
-            Episodes, (L, B, D).
-        commands (`jax.Array`):
-            What is commanded in them, (L, B, D_j).
-        noise (`jax.Array`):
-            Standard normal numbers, (L, N, B, hidden sizes).
-        noise_bounds (`jax.Array`):
-            `low` and `high` of the `NoiseSchedule`, (2, 2).
-        sizes (`ScanSizes`):
-            What is known when compiling.
-
-    Returns:
-        `tuple[jax.Array, jax.Array]`: the loss, and the chosen candidates (L, B).
+    `parameters` under the names of `SHLSTM`, `inputs` and `targets` (L, B, D), `commands` (L, B, D_j), standard normal
+    `noise` (L, N, B, hidden sizes), and `low` and `high` of the `NoiseSchedule` in `noise_bounds` (2, 2).
     """
     batch_size, num_samples = inputs.shape[1], noise.shape[1]
     parts = (sizes.joint_hidden, sizes.image_hidden, sizes.shared_hidden)
@@ -247,24 +234,9 @@ def update(
     learning_rate: float,
     clip_norm: float,
 ) -> tuple[AdamState, jax.Array]:
-    """One training update: loss, gradients, clipping, Adam.
+    """One training update (loss, gradients, clipping, Adam): the next state, and the loss before it.
 
-    Args:
-        state (`AdamState`):
-            Parameters and moments; its memory is used again.
-        inputs (`jax.Array`), targets (`jax.Array`), commands (`jax.Array`):
-            See `loss`.
-        noise (`jax.Array`), noise_bounds (`jax.Array`):
-            See `loss`.
-        sizes (`ScanSizes`):
-            See `loss`.
-        learning_rate (`float`):
-            Adam's learning rate.
-        clip_norm (`float`):
-            Largest norm of the gradient.
-
-    Returns:
-        `tuple[AdamState, jax.Array]`: the next state, and the loss before the update.
+    The memory of `state` is used again; the other arguments are those of `loss`.
     """
     (value, _), gradients = jax.value_and_grad(loss, has_aux=True)(
         state.parameters, inputs, targets, commands, noise, noise_bounds, sizes
