@@ -29,7 +29,7 @@ def run[Config](main: Callable[[Config], None], config_class: type[Config]) -> N
     """Runs a script with the flags of its command line; what is wrong is said without a traceback."""
     name = Path(sys.argv[0]).name
     try:
-        main(parse_flags(config_class, sys.argv[1:]))
+        main(parse_flags(config_class, sys.argv[1:], f"python experiments/{name}"))
     except KeyboardInterrupt:
         sys.exit(130)
     except (ValueError, OSError, RuntimeError, ParsingError) as error:

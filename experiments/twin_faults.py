@@ -55,7 +55,7 @@ class Injection:
 
 def on_twin(name: str, **parameters: float) -> Action:
     """Something that the twin offers."""
-    return lambda twin, command: twin.fault(name, **parameters)
+    return lambda twin, command: twin.inject(name, **parameters)
 
 
 def send(number: int) -> Action:

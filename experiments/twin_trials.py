@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from twin import FPS, StockCommand, describe_failure, late_ticks, robot_flags, run
 
 from env_door.checks import check_range
-from env_door.env import MAX_HOLD
 from env_door.latch import KINDS, check_kinds
+from env_door.limits import MAX_HOLD
 from env_door.trials import Trial, append_trial, read_trials
 from env_door.twin import TwinProcess
-from lerobot_ufrnn.analysis.results import summarize, to_markdown
+from lerobot_ufrnn.analysis.results import count_by_door, to_markdown
 
 START_SECONDS = 120.0  # longest time for a roll-out to load its policy and connect
 POLL_SECONDS = 0.05
@@ -65,7 +65,7 @@ def main(config: TrialsConfig) -> None:
                 print(f"{kind} door, seed {seed}: {outcome}; tried {tried}; {note}", flush=True)
     if intervals:
         print(f"\n{describe_intervals(np.concatenate(intervals))}")
-    print("\n" + to_markdown(summarize(read_trials(log))), end="")
+    print("\n" + to_markdown(count_by_door(read_trials(log))), end="")
 
 
 def try_door(twin: TwinProcess, policy_path: str, kind: str, seed: int, duration: float) -> tuple[Trial, str]:
