@@ -13,19 +13,29 @@ import draccus
 import pytest
 import yaml
 
+from env_door.configuration_door import DoorEnvConfig
 from lerobot_ufrnn.commands import COMMANDS
 from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
+from lerobot_ufrnn.robots.ur5e_robotiq import UR5eRobotiqConfig
+from lerobot_ufrnn.teleoperators import KeyboardTwistConfig, SpaceMouseTwistConfig
 
 ROOT = Path(__file__).parents[1]
 TODAY = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 PAGES = [*TODAY, ROOT / "CHANGELOG.md"]  # this one names what was, too
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
-REPOSITORY = "https://github.com/ufrnn/lerobot_policy_ufrnn"
+REPOSITORY = yaml.safe_load((ROOT / "CITATION.cff").read_text())["repository-code"]
 IN_REPOSITORY = (
     f"{REPOSITORY}/blob/main/",
-    "https://raw.githubusercontent.com/ufrnn/lerobot_policy_ufrnn/main/",
+    f"{REPOSITORY.replace('//github.com', '//raw.githubusercontent.com')}/main/",
 )
 FOLDERS = "lerobot_ufrnn|env_door|experiments|configs|docs|scripts|tests"
+
+
+OTHERS = {
+    "env": (DoorEnvConfig,),
+    "robot": (UR5eRobotiqConfig,),
+    "teleop": (KeyboardTwistConfig, SpaceMouseTwistConfig),
+}
 
 
 def by_name(path: Path) -> str:
@@ -100,15 +110,20 @@ def test_links_lead_to_files_and_headings(page: Path):
 
 
 def test_links_of_the_readme_work_outside_of_the_repository():
-    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"].values()
-    assert any(url.startswith(REPOSITORY) for url in urls)
-    assert not re.findall(r"\]\((?!https://)", (ROOT / "README.md").read_text())
+    text = (ROOT / "README.md").read_text()
+    assert not re.findall(r"\]\((?!https://)", text)
+    assert all(prefix in text for prefix in IN_REPOSITORY)
+
+
+def test_repository_is_the_one_of_the_package():
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"].get("urls", {})
+    assert any(url.startswith(REPOSITORY) for url in urls.values()), f"{REPOSITORY} is not in [project.urls]: {urls}"
 
 
 @pytest.mark.parametrize("path", [*TODAY, *CONFIGS], ids=by_name)
 def test_files_that_are_named_exist(path: Path):
-    # What commands write goes to `outputs` and `data`; `<...>` is for the reader to fill in.
-    for name in re.findall(rf"(?<![\w/.])(?:{FOLDERS})/[\w./-]*\w", path.read_text()):
+    text = path.read_text().replace("env_door/Door-v0", "")  # the environment's name in Gymnasium's registry
+    for name in re.findall(rf"(?<![\w/.])(?:{FOLDERS})/[\w./-]*\w", text):
         assert (ROOT / name).exists(), f"there is no {name}"
 
 
@@ -127,12 +142,19 @@ def test_commands_and_their_flags_exist(path: Path):
 
 @pytest.mark.parametrize("path", [*TODAY, *CONFIGS], ids=by_name)
 def test_flags_of_the_policy_are_fields(path: Path):
-    for name, value in policy_flags(path) - {("type", "ufrnn"), ("path", None)}:
-        if name in ("path", "type"):
+    for name, value in policy_flags(path):
+        if name in ("type", "path"):  # LeRobot's own
             continue
         assert name in leaves(UFRNNConfig())
         if value is not None:
             draccus.decode(UFRNNConfig, nested(name, yaml.safe_load(value)))
+
+
+@pytest.mark.parametrize("path", [*TODAY, *CONFIGS], ids=by_name)
+def test_flags_of_environment_robot_and_teleoperator_are_fields(path: Path):
+    for group, name in re.findall(r"--(env|robot|teleop)\.(\w+)", "\n".join(code(path))):
+        known = {field.name for config in OTHERS[group] for field in fields(config)}
+        assert name in known | {"type"}, f"--{group}.{name}"
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=by_name)
