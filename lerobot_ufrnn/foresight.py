@@ -170,7 +170,11 @@ class ForesightTrace:
             return torch.stack([getattr(trace, name) for trace in traces])
 
         return cls(
-            *(over_time(name) for name in ("noise_std", "chosen", "baseline", "final", "horizon")),
+            over_time("noise_std"),
+            over_time("chosen"),
+            over_time("baseline"),
+            over_time("final"),
+            over_time("horizon"),
             None if traces[0].calmest is None else over_time("calmest"),
             Prediction(*map(torch.stack, zip(*(trace.imagined for trace in traces), strict=True))),
         )
@@ -184,12 +188,15 @@ class ForesightTrace:
 
     def at(self, step: int) -> "ForesightTrace":
         """The trace of one step of L."""
-        values = [self.noise_std, self.chosen, self.baseline, self.final, self.horizon]
         calmest, futures = self.calmest, self.futures
         return ForesightTrace(
-            *(value[step] for value in values),
+            self.noise_std[step],
+            self.chosen[step],
+            self.baseline[step],
+            self.final[step],
+            self.horizon[step],
             None if calmest is None else calmest[step],
-            None if futures is None else Prediction(*(value[step] for value in futures)),
+            None if futures is None else Prediction(*(values[step] for values in futures)),
         )
 
 
