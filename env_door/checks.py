@@ -44,7 +44,9 @@ def check_range(
                 and (above is None or number > above)
                 and (below is None or number < below)
             ):
-                raise ParsingError(f"`{name}` must be {allowed}{unit and ' ' + unit}, got {value}.")
+                raise ParsingError(
+                    f"`{name}` must be {allowed}{unit and ' ' + unit}, got {value} ({type(config).__name__})."
+                )
 
 
 def check_pair(config: object, *names: str, strictly: bool = False) -> None:

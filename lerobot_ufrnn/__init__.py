@@ -1,17 +1,31 @@
-"""UF-RNN for LeRobot: a recurrent policy that imagines its futures and explores where it is uncertain."""
+"""UF-RNN for LeRobot: a recurrent policy that imagines its futures and explores where it is uncertain.
 
-from typing import TYPE_CHECKING, Any
+The public names; each is imported when it is first used, as PyTorch and LeRobot take seconds and half a gigabyte.
+"""
 
-if TYPE_CHECKING:
-    from .configuration_ufrnn import UFRNNConfig
+from importlib import import_module
+from typing import Any
 
-__all__ = ["UFRNNConfig"]
+_MODULES = {
+    "configuration_ufrnn": (
+        "UFRNNConfig",
+        "ForesightConfig",
+        "RecallConfig",
+        "AutoencoderConfig",
+        "AugmentationConfig",
+    ),
+    "modeling_ufrnn": ("UFRNNPolicy",),
+    "processor_ufrnn": ("make_ufrnn_pre_post_processors",),
+    "networks": ("SHLSTM", "HiddenState", "Prediction"),
+    "foresight": ("UFRNN", "Foresight", "ForesightTrace", "perturb", "roll_out", "select"),
+    "recall": ("Recall", "RecallEvent"),
+}
+
+__all__ = [name for names in _MODULES.values() for name in names]
 
 
 def __getattr__(name: str) -> Any:
-    # On demand: LeRobot and PyTorch take seconds and half a gigabyte, which a command that only starts others spares.
-    if name == "UFRNNConfig":
-        from .configuration_ufrnn import UFRNNConfig
-
-        return UFRNNConfig
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f".{module}", __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

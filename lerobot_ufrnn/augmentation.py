@@ -9,22 +9,10 @@ from torch import Generator, Tensor
 def augment_images(
     images: Tensor, max_shift: int, colour_jitter: float, noise_std: float, generator: Generator | None = None
 ) -> Tensor:
-    """Shifts, recolours and roughens images; the autoencoder must still reconstruct the clean ones.
+    """Shifts, recolours and roughens images (B, 3, height, width) in [0, 1]; the clean ones are to be reconstructed.
 
-    Args:
-        images (`Tensor`):
-            Images (B, 3, height, width) in [0, 1].
-        max_shift (`int`):
-            Largest shift in pixels to either side, the same for both axes; borders are repeated.
-        colour_jitter (`float`):
-            Largest relative change of each image's brightness and of each of its colour channels.
-        noise_std (`float`):
-            Standard deviation of the pixel noise.
-        generator (`torch.Generator`, *optional*):
-            Source of randomness.
-
-    Returns:
-        `Tensor`: augmented images in [0, 1], same shape.
+    Shifts are of up to `max_shift` pixels along both axes, with borders repeated; jitter is the largest relative change
+    of each image's brightness and of each of its colour channels.
     """
     batch_size, _, height, width = images.shape
 
@@ -46,22 +34,9 @@ def augment_images(
 def drifting_noise(like: Tensor, std: float, correlation: float, generator: Generator | None = None) -> Tensor:
     """Noise that drifts over an episode: a stationary first-order autoregressive process in each dimension.
 
-    A network that reads its inputs with it, and must still predict what was demonstrated, learns to lead back to the
-    demonstrated way from beside it. Independent noise does not teach that: it averages out over a few steps.
-
-    Args:
-        like (`Tensor`):
-            What it is added to, (B, L, D).
-        std (`float`):
-            Standard deviation at every step.
-        correlation (`float`):
-            Correlation of one step with the next, from 0 (white noise) to below 1; it falls to 1/e over
-            `-1 / log(correlation)` steps.
-        generator (`torch.Generator`, *optional*):
-            Source of randomness.
-
-    Returns:
-        `Tensor`: noise, (B, L, D).
+    A network that reads its inputs (B, L, D) with it, and must still predict what was demonstrated, learns to lead back
+    to the demonstrated way from beside it. Independent noise does not teach that: it averages out over a few steps.
+    The correlation falls to 1/e over `-1 / log(correlation)` steps.
     """
     white = std * torch.randn(like.shape, generator=generator, dtype=like.dtype, device=like.device)
     steps = [white[:, 0]]
@@ -71,19 +46,10 @@ def drifting_noise(like: Tensor, std: float, correlation: float, generator: Gene
 
 
 def hold_end(values: Tensor, num_steps: int) -> Tensor:
-    """Goes on with an episode's last moment for some steps.
+    """Goes on with an episode's last moment: (L, D) -> (L + num_steps, D).
 
     Recordings often stop as soon as the task is done, while the arm still moves. A network that has never seen what
     comes after slows down on its way there; one that has learned to stay where a demonstration ended is led to it.
-
-    Args:
-        values (`Tensor`):
-            What was recorded, (L, D).
-        num_steps (`int`):
-            How many steps to add.
-
-    Returns:
-        `Tensor`: (L + num_steps, D).
     """
     return torch.cat((values, values[-1:].expand(num_steps, -1)))
 
@@ -96,20 +62,9 @@ def stall_indices(
     Inputs and targets read through the same index, so that while the observation stands still its target waits too:
     the next move depends on what is seen, not on how much time has passed.
 
-    Args:
-        length (`int`):
-            Steps L of the episode.
-        probability (`float`):
-            Probability that a stall begins at any step.
-        max_steps (`int`):
-            Longest stall; its length is uniform from 1 to this.
-        max_length (`int`):
-            Longest result. Once stalls have used up `max_length - length` steps, no further one begins.
-        generator (`torch.Generator`, *optional*):
-            Source of randomness.
-
-    Returns:
-        `Tensor`: non-decreasing indices from 0 to L-1, each at least once, int64 (L <= length' <= max_length,).
+    A stall begins at any step with `probability` and lasts 1 to `max_steps` steps, uniformly; once stalls have used up
+    `max_length - length` steps, no further one begins. The indices are non-decreasing, from 0 to `length` - 1, each at
+    least once.
     """
     begins = torch.rand(length, generator=generator) < probability
     extra = torch.randint(1, max_steps + 1, (length,), generator=generator) * begins

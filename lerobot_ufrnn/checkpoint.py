@@ -10,46 +10,19 @@ from torch import Tensor
 
 
 def find_weights(path: str) -> Path:
-    """The weights of a checkpoint.
-
-    Args:
-        path (`str`):
-            Checkpoint folder, or Hub repository `user/name`.
-
-    Returns:
-        `Path`: its `model.safetensors`, downloaded where needed.
-
-    Raises:
-        ValueError: If it is neither.
-    """
+    """`model.safetensors` of a checkpoint folder or a Hub repository `user/name`, downloaded where needed."""
     folder = Path(path).expanduser()
     if folder.is_dir():
         return folder / SAFETENSORS_SINGLE_FILE
     if folder.exists() or path.count("/") != 1 or path.startswith((".", "/", "~")):
         raise ValueError(
-            f"`autoencoder_path` must be a checkpoint folder or a Hub repository 'user/name', got '{path}'."
+            f"`autoencoder.path` must be a checkpoint folder or a Hub repository 'user/name', got '{path}'."
         )
     return Path(hf_hub_download(path, SAFETENSORS_SINGLE_FILE))
 
 
 def read_weights(file: str | Path, expected: dict[str, Tensor], prefix: str = "") -> dict[str, Tensor]:
-    """Reads weights and checks names and shapes.
-
-    Args:
-        file (`str | Path`):
-            A safetensors file.
-        expected (`dict[str, Tensor]`):
-            Names and shapes that it must hold.
-        prefix (`str`, *optional*, defaults to `""`):
-            Read only the weights whose names begin with this, and drop it from their names.
-
-    Returns:
-        `dict[str, Tensor]`: the weights.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is broken, or holds the weights of another network.
-    """
+    """Weights whose names begin with `prefix`, without it; refused unless names and shapes are those `expected`."""
     try:
         weights = load_file(file)
     except FileNotFoundError as error:

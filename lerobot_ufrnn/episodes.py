@@ -45,17 +45,6 @@ class EpisodeStore:
     LeRobot's data loader names the episodes of a batch; their frames come from here. Each video is decoded once, when
     its episode is first named, and its frames give way to the features once the autoencoder is trained. Only episodes
     that were named are ever read, so a held-out split stays unseen.
-
-    Args:
-        meta (`LeRobotDatasetMetadata`):
-            Metadata of the dataset; `encode` strikes the videos from it.
-        cameras (`tuple[str, ...]`):
-            Camera keys to load.
-        encoder (`ImageEncoder`):
-            Encodes the frames; also says to what size they are kept.
-
-    Raises:
-        ValueError: If the dataset has no episode, or lacks joints or a camera.
     """
 
     def __init__(self, meta: "LeRobotDatasetMetadata", cameras: tuple[str, ...], encoder: ImageEncoder):
@@ -85,18 +74,7 @@ class EpisodeStore:
         return self._episodes
 
     def __getitem__(self, index: int) -> Episode:
-        """The episode with this index.
-
-        Args:
-            index (`int`):
-                `episode_index` in the dataset.
-
-        Returns:
-            `Episode`: with frames, or with features after `encode`.
-
-        Raises:
-            ValueError: If the episode is too short, holds values that are not finite, or lacks a camera.
-        """
+        """The episode with this `episode_index`: frames, or features after `encode`. A broken one is refused."""
         if index not in self._episodes:
             episode = self._load(index)
             self._episodes[index] = self._encode(episode) if self._encoded else episode
@@ -107,8 +85,8 @@ class EpisodeStore:
         """Replaces all frames by features; episodes named later are encoded as they come.
 
         From now on LeRobot's loader need not decode a frame for each item either, which would take half as long as the
-        update itself: the videos are struck from the metadata that this store was given, and so from the items of the
-        dataset that it belongs to.
+        update itself: the videos are removed from the metadata that this store was given, and so from the items of
+        the dataset that it belongs to.
         """
         self._encoded = True
         for key in self._meta.video_keys:

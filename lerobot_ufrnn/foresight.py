@@ -1,17 +1,21 @@
 """Foresight: imagine noisy futures, keep the state whose future is least uncertain (UF-RNN, Sec. III-C, Fig. 2(C)).
 
 Three functions read like the figure: `perturb` the hidden state, `roll_out` each candidate in closed loop, `select` the
-candidate whose predicted variance falls most. `Foresight` joins them. Candidates are stacked candidate-major: row
-`n * B + b` of a stacked tensor is candidate n of sequence b.
+candidate whose predicted variance falls most. `Foresight` joins them, and `UFRNN` runs network and foresight step by
+step. Candidates are stacked candidate-major: row `n * B + b` of a stacked tensor is candidate n of sequence b.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Generator, Tensor, nn
 
 from .networks import SHLSTM, HiddenState, Prediction
+
+if TYPE_CHECKING:
+    from .configuration_ufrnn import ForesightConfig, UFRNNConfig
 
 PERTURBED_STATES: dict[str, tuple[str, ...]] = {
     "hidden": ("h_joint", "h_image", "h_shared"),
@@ -20,6 +24,8 @@ PERTURBED_STATES: dict[str, tuple[str, ...]] = {
 }
 MODALITIES = ("joint", "image")
 RANGE_QUANTILES = (0.05, 0.95)
+RANGE_MOMENTUM = 0.05
+"""Weight of the newest update in the moving average of the variance's range."""
 
 
 def modality_means(values: Tensor, joint_dim: int) -> Tensor:
@@ -28,57 +34,16 @@ def modality_means(values: Tensor, joint_dim: int) -> Tensor:
 
 
 def uncertainty(log_variance: Tensor, joint_dim: int, aggregation: str) -> Tensor:
-    """One number for how uncertain a prediction is: the sum of both modalities' means.
+    """One number for how uncertain a prediction is, (..., D) -> (...): the sum of both modalities' means.
 
-    Args:
-        log_variance (`Tensor`):
-            Predicted log-variances, (..., D).
-        joint_dim (`int`):
-            How many of the D dimensions are joints.
-        aggregation (`str`):
-            `variance` averages variances, `entropy` averages log-variances (the entropy up to a constant).
-
-    Returns:
-        `Tensor`: uncertainty, (...).
+    `aggregation` is `variance`, or `entropy` for log-variances (the entropy up to a constant).
     """
     values = log_variance if aggregation == "entropy" else log_variance.exp()
     return modality_means(values, joint_dim).sum(-1)
 
 
-def sample_noise(
-    state: HiddenState,
-    num_samples: int,
-    perturbed: tuple[str, ...],
-    keep_unperturbed: bool = False,
-    generator: Generator | None = None,
-) -> Tensor:
-    """Standard normal noise for the perturbed states.
-
-    Args:
-        state (`HiddenState`):
-            The state to perturb, (B, hidden size) each.
-        num_samples (`int`):
-            Number of candidates N.
-        perturbed (`tuple[str, ...]`):
-            Names of the `HiddenState` fields to perturb, in their order.
-        keep_unperturbed (`bool`, *optional*, defaults to `False`):
-            Leave the first candidate as it is.
-        generator (`torch.Generator`, *optional*):
-            Source of randomness; PyTorch's global one when not given.
-
-    Returns:
-        `Tensor`: noise of the perturbed fields side by side, (N, B, sum of their hidden sizes).
-    """
-    size = sum(getattr(state, name).shape[-1] for name in perturbed)
-    like = state.h_joint
-    noise = torch.randn(num_samples, like.shape[0], size, dtype=like.dtype, device=like.device, generator=generator)
-    if keep_unperturbed:
-        noise[0] = 0
-    return noise
-
-
 def perturb(state: HiddenState, noise: Tensor, noise_std: Tensor, perturbed: tuple[str, ...]) -> HiddenState:
-    """Candidates `H^n ~ N(H_t, f(var))`.
+    """Candidates `H^n ~ N(H_t, f(var))` (Sec. III-C.1).
 
     Args:
         state (`HiddenState`):
@@ -107,19 +72,7 @@ def perturb(state: HiddenState, noise: Tensor, noise_std: Tensor, perturbed: tup
 
 
 def imagine_states(network: SHLSTM, state: HiddenState, num_steps: int) -> list[HiddenState]:
-    """Closed loop: a state and those that follow when the predicted means are fed back as inputs.
-
-    Args:
-        network (`SHLSTM`):
-            The network that imagines.
-        state (`HiddenState`):
-            Where to start from, (M, hidden size) each.
-        num_steps (`int`):
-            Number of steps T.
-
-    Returns:
-        `list[HiddenState]`: `state` and the state after each of the T steps, (M, hidden size) each.
-    """
+    """Closed loop: a state (M, hidden size) and the T states that follow when predicted means are fed back."""
     states = [state]
     for _ in range(num_steps):
         states.append(network.step(network.predict_mean(states[-1]), states[-1]))
@@ -127,33 +80,14 @@ def imagine_states(network: SHLSTM, state: HiddenState, num_steps: int) -> list[
 
 
 def roll_out(network: SHLSTM, state: HiddenState, horizon: int) -> Prediction:
-    """Closed-loop prediction: feeds the predicted means back as inputs for `horizon` steps.
-
-    Args:
-        network (`SHLSTM`):
-            The network that imagines.
-        state (`HiddenState`):
-            Where to start from, (M, hidden size) each.
-        horizon (`int`):
-            Number of steps T.
-
-    Returns:
-        `Prediction`: the predictions after each of the T steps, (T, M, ...) each.
-    """
+    """What states (M, hidden size) imagine: predictions after each of T steps in closed loop, (T, M, ...) each."""
     return network.predict(HiddenState.stack(imagine_states(network, state, horizon)[1:]))
 
 
 def select(baseline: Tensor, final: Tensor) -> Tensor:
-    """Index of the candidate whose uncertainty fell most: `argmax_n (o_t^var - o_{t+T}^{n,var})`.
+    """Index (B,) of the candidate whose uncertainty fell most: `argmax_n (o_t^var - o_{t+T}^{n,var})` (Sec. III-C.3).
 
-    Args:
-        baseline (`Tensor`):
-            Uncertainty now, (N, B), or (1, B) if common to all candidates.
-        final (`Tensor`):
-            Uncertainty at the horizon, (N, B).
-
-    Returns:
-        `Tensor`: chosen candidate of each sequence, int64 (B,).
+    `baseline` (N, B) is the uncertainty now, `final` (N, B) that at the horizon.
     """
     return (baseline - final).argmax(dim=0)
 
@@ -161,64 +95,47 @@ def select(baseline: Tensor, final: Tensor) -> Tensor:
 class NoiseSchedule(nn.Module):
     """`f`: maps the predicted variance of each modality to the standard deviation of the hidden-state noise.
 
-    The variance is placed within the range it has lately run through, and that place within `[low, high]` of the noise.
-    The range follows training by an exponential moving average of two quantiles of each update: variances shrink by
-    orders of magnitude while a network learns, and a range that never forgot would switch exploration off; the true
-    extremes would let an episode's very first step, of which nothing can be known, dwarf all others.
+    The variance is placed within the range it has lately run through, and that place within `noise_range`. The range
+    follows training by an exponential moving average of two quantiles of each update: variances shrink by orders of
+    magnitude while a network learns, and a range that never forgot would switch exploration off; the true extremes
+    would let an episode's very first step, of which nothing can be known, dwarf all others.
 
     Args:
-        noise_range (`tuple[float, float]`):
-            Noise at the least and at the most uncertain moment.
-        noise_unit (`str`):
-            Whether `noise_range` is a `variance` or a `std` (standard deviation).
-        log_scale (`bool`):
-            Place the variance on a logarithmic scale.
-        momentum (`float`, *optional*, defaults to `0.05`):
-            Weight of the newest update in the moving average.
+        config (`ForesightConfig`):
+            Its `noise_range`, `noise_unit` and `noise_scale`.
     """
 
     low: Tensor
     high: Tensor
     is_initialized: Tensor
 
-    def __init__(self, noise_range: tuple[float, float], noise_unit: str, log_scale: bool, momentum: float = 0.05):
+    def __init__(self, config: "ForesightConfig"):
         super().__init__()
-        self.noise_range = noise_range
-        self.noise_unit = noise_unit
-        self.log_scale = log_scale
-        self.momentum = momentum
+        self.config = config
         self.register_buffer("low", torch.zeros(len(MODALITIES)))
         self.register_buffer("high", torch.zeros(len(MODALITIES)))
         self.register_buffer("is_initialized", torch.zeros((), dtype=torch.bool))
 
     def forward(self, variance: Tensor) -> Tensor:
-        """Standard deviation of the noise.
-
-        Args:
-            variance (`Tensor`):
-                Mean predicted variance of each modality, (..., 2).
-
-        Returns:
-            `Tensor`: standard deviation, (..., 2).
-        """
-        value = variance.log() if self.log_scale else variance
+        """Standard deviation of the noise (..., 2), from the mean predicted variance of each modality (..., 2)."""
+        value = variance.log() if self.config.noise_scale == "log" else variance
         place = ((value - self.low) / (self.high - self.low).clamp(min=1e-12)).clamp(0, 1)
-        low, high = self.noise_range
+        low, high = self.config.noise_range
         noise = low + (high - low) * place
-        return noise.sqrt() if self.noise_unit == "variance" else noise
+        return noise.sqrt() if self.config.noise_unit == "variance" else noise
 
     @torch.no_grad()
     def observe(self, variance: Tensor) -> None:
         """Moves the range towards that of `variance` (M, 2), one training update's worth of variances."""
-        value = variance.log() if self.log_scale else variance
+        value = variance.log() if self.config.noise_scale == "log" else variance
         low, high = value.quantile(value.new_tensor(RANGE_QUANTILES), dim=0)
         if not self.is_initialized:
             self.low.copy_(low)
             self.high.copy_(high)
             self.is_initialized.fill_(True)
         else:
-            self.low.lerp_(low, self.momentum)
-            self.high.lerp_(high, self.momentum)
+            self.low.lerp_(low, RANGE_MOMENTUM)
+            self.high.lerp_(high, RANGE_MOMENTUM)
 
 
 @dataclass(frozen=True)
@@ -264,11 +181,7 @@ class ForesightTrace:
 
     @property
     def imagined(self) -> Prediction:
-        """`Prediction`: `futures`.
-
-        Raises:
-            RuntimeError: If they were not kept.
-        """
+        """`Prediction`: `futures`; a RuntimeError if they were not kept."""
         if self.futures is None:
             raise RuntimeError("The fast kernel keeps no imagined futures; load the policy with kernel='reference'.")
         return self.futures
@@ -291,48 +204,17 @@ class Foresight(nn.Module):
     """Explores around a hidden state: with foresight (UF-RNN), with bare noise (SH-RNN+noise) or not at all (SH-RNN).
 
     Args:
-        exploration (`str`):
-            `foresight`, `noise` or `none`.
-        schedule (`NoiseSchedule`):
-            Maps predicted variance to noise.
-        num_samples (`int`):
-            Candidates N; `noise` uses one.
-        horizon (`int`):
-            Steps T imagined ahead; the longest horizon where it is learned.
-        learned_horizon (`bool`):
-            Each candidate counts at `ceil(T * sigmoid(step))`, the larger of both modalities, instead of at T.
-        perturbed_states (`str`):
-            A key of `PERTURBED_STATES`.
-        baseline (`str`):
-            `common`: the variance predicted for this step, the same for all; `candidate`: each candidate's own.
-        aggregation (`str`):
-            See `uncertainty`.
-        keep_unperturbed (`bool`):
-            Whether the unperturbed state is one of the candidates.
+        config (`UFRNNConfig`):
+            Its `exploration` and `foresight`.
     """
 
-    def __init__(
-        self,
-        exploration: str,
-        schedule: NoiseSchedule,
-        num_samples: int,
-        horizon: int,
-        learned_horizon: bool = False,
-        perturbed_states: str = "hidden",
-        baseline: str = "common",
-        aggregation: str = "variance",
-        keep_unperturbed: bool = False,
-    ):
+    def __init__(self, config: "UFRNNConfig"):
         super().__init__()
-        self.exploration = exploration
-        self.schedule = schedule
-        self.num_samples = num_samples if exploration == "foresight" else 1
-        self.horizon = horizon
-        self.learned_horizon = learned_horizon
-        self.perturbed = PERTURBED_STATES[perturbed_states]
-        self.baseline = baseline
-        self.aggregation = aggregation
-        self.keep_unperturbed = keep_unperturbed and exploration == "foresight"
+        self.config = config.foresight
+        self.exploration = config.exploration
+        self.num_samples = self.config.num_samples if self.exploration == "foresight" else 1
+        self.perturbed = PERTURBED_STATES[self.config.perturbed_states]
+        self.schedule = NoiseSchedule(self.config)
 
     def forward(
         self,
@@ -373,28 +255,126 @@ class Foresight(nn.Module):
         return perturb(state, chosen_noise, noise_std, self.perturbed), trace
 
     def sample_noise(self, state: HiddenState, generator: Generator | None = None) -> Tensor:
-        """Noise for one step, (N, B, S): see [`sample_noise`]."""
-        return sample_noise(state, self.num_samples, self.perturbed, self.keep_unperturbed, generator)
+        """Standard normal noise of the perturbed fields side by side, (N, B, sum of their hidden sizes)."""
+        batch_size, like = len(state.h_joint), state.h_joint
+        size = sum(getattr(state, name).shape[-1] for name in self.perturbed)
+        shape = (self.num_samples, batch_size, size)
+        noise = torch.randn(shape, dtype=like.dtype, device=like.device, generator=generator)
+        if self.config.keep_unperturbed and self.exploration == "foresight":
+            noise[0] = 0
+        return noise
 
     def _imagine(
         self, network: SHLSTM, candidates: HiddenState, previous: Prediction, noise_std: Tensor
     ) -> ForesightTrace:
-        batch_size = noise_std.shape[0]
+        config, batch_size = self.config, noise_std.shape[0]
 
         def unstack(values: Tensor) -> Tensor:  # (..., N * B, D) -> (..., N, B, D)
             return values.unflatten(-2, (self.num_samples, batch_size))
 
-        futures = Prediction(*map(unstack, roll_out(network, candidates, self.horizon)))  # (T, N, B, ...)
-        uncertainties = uncertainty(futures.log_variance, network.joint_dim, self.aggregation)  # (T, N, B)
-        horizon, calmest = torch.full_like(uncertainties[0], self.horizon, dtype=torch.int64), None
-        baseline = uncertainty(previous.log_variance, network.joint_dim, self.aggregation).expand_as(horizon)
-        if self.learned_horizon or self.baseline == "candidate":
-            now = network.predict(candidates)
-        if self.learned_horizon:
-            fraction = torch.sigmoid(unstack(now.step)).amax(-1)  # (N, B)
-            horizon = (fraction * self.horizon).ceil().long().clamp(1, self.horizon)
+        def uncertainty_of(log_variance: Tensor) -> Tensor:
+            return uncertainty(log_variance, network.joint_dim, config.variance_aggregation)
+
+        futures = Prediction(*map(unstack, roll_out(network, candidates, config.horizon)))  # (T, N, B, ...)
+        uncertainties = uncertainty_of(futures.log_variance)  # (T, N, B)
+        horizon, calmest = torch.full_like(uncertainties[0], config.horizon, dtype=torch.int64), None
+        baseline = uncertainty_of(previous.log_variance).expand_as(horizon)
+        if config.horizon_mode == "learned":
+            fraction = torch.sigmoid(unstack(network.predict(candidates).step)).amax(-1)  # (N, B)
+            horizon = (fraction * config.horizon).ceil().long().clamp(1, config.horizon)
             calmest = uncertainties.argmin(0) + 1
-        if self.baseline == "candidate":
-            baseline = uncertainty(unstack(now.log_variance), network.joint_dim, self.aggregation)
+        if config.variance_baseline == "candidate":
+            baseline = uncertainty_of(unstack(network.predict(candidates).log_variance))
         final = uncertainties.gather(0, (horizon - 1).unsqueeze(0)).squeeze(0)
         return ForesightTrace(noise_std, select(baseline, final), baseline, final, horizon, calmest, futures)
+
+
+class Memory(NamedTuple):
+    """What one step hands to the next: the hidden state that was kept and what it predicts."""
+
+    state: HiddenState
+    prediction: Prediction
+
+
+class UFRNN(nn.Module):
+    """SH-LSTM whose hidden state foresight refines at every step, in training and at run time.
+
+    Args:
+        config (`UFRNNConfig`):
+            Configuration with its features filled in.
+    """
+
+    def __init__(self, config: "UFRNNConfig"):
+        super().__init__()
+        self.network = SHLSTM(config)
+        self.foresight = Foresight(config)
+
+    def initial_memory(self, batch_size: int) -> Memory:
+        """Memory of `batch_size` sequences that have seen nothing."""
+        state = self.network.initial_state(batch_size)
+        return Memory(state, self.network.predict(state))
+
+    def advance(
+        self, inputs: Tensor, memory: Memory, generator: Generator | None = None, explore: bool = True
+    ) -> tuple[Memory, ForesightTrace | None]:
+        """One time step: read the inputs, explore, predict.
+
+        Args:
+            inputs (`Tensor`):
+                Scaled joints and image features, (B, D).
+            memory (`Memory`):
+                Memory after the previous step.
+            generator (`torch.Generator`, *optional*):
+                Source of the exploration noise.
+            explore (`bool`, *optional*, defaults to `True`):
+                Whether foresight refines the state.
+
+        Returns:
+            `tuple[Memory, ForesightTrace | None]`: memory after this step, and what foresight saw.
+        """
+        state, trace = self.network.step(inputs, memory.state), None
+        if explore:
+            state, trace = self.foresight(self.network, state, memory.prediction, generator)
+        return Memory(state, self.network.predict(state)), trace
+
+    @torch.no_grad()
+    def imagine(self, state: HiddenState, num_steps: int) -> HiddenState:
+        """T time steps in closed loop, without exploring: the predicted means are fed back as inputs.
+
+        Args:
+            state (`HiddenState`):
+                Where to start from, (M, hidden size) each.
+            num_steps (`int`):
+                Number of steps T.
+
+        Returns:
+            `HiddenState`: `state` and the state after each of the T steps, (T + 1, M, hidden size) each.
+        """
+        return HiddenState.stack(imagine_states(self.network, state, num_steps))
+
+    def forward(self, inputs: Tensor, generator: Generator | None = None) -> tuple[Prediction, ForesightTrace | None]:
+        """Predicts every next step of whole episodes, reading the measured inputs (teacher forcing).
+
+        Args:
+            inputs (`Tensor`):
+                Scaled joints and image features, (B, L, D).
+            generator (`torch.Generator`, *optional*):
+                Source of the exploration noise.
+
+        Returns:
+            `tuple[Prediction, ForesightTrace | None]`: predictions stacked over time, (B, L, ...) each, and
+                what foresight saw at each of the L steps (`None` without foresight).
+        """
+        memory = self.initial_memory(inputs.shape[0])
+        predictions, traces = [], []
+        for step_inputs in inputs.unbind(dim=1):
+            memory, trace = self.advance(step_inputs, memory, generator)
+            predictions.append(memory.prediction)
+            if trace is not None:
+                traces.append(trace)
+        prediction = Prediction(*(torch.stack(values, dim=1) for values in zip(*predictions, strict=True)))
+        return prediction, ForesightTrace.stack(traces) if traces else None
+
+    def modality_variance(self, prediction: Prediction) -> Tensor:
+        """Mean predicted variance of each modality, (..., 2), joints first."""
+        return modality_means(prediction.log_variance.exp(), self.network.joint_dim)

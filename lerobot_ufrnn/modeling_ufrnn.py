@@ -13,11 +13,9 @@ from .augmentation import augment_images, drifting_noise, hold_end, stall_indice
 from .checkpoint import find_weights, read_weights
 from .configuration_ufrnn import UFRNNConfig
 from .episodes import Episode, EpisodeStore
-from .foresight import Foresight, ForesightTrace, NoiseSchedule
-from .networks import SHLSTM, ImageEncoder, Prediction, RangeScaler, gaussian_nll
-from .recall import Recall
-from .recurrent import UFRNN, Memory
-from .rest import RestDetector
+from .foresight import UFRNN, ForesightTrace, Memory
+from .networks import ImageEncoder, Prediction, RangeScaler, gaussian_nll
+from .recall import Recall, RestDetector
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +33,7 @@ class UFRNNPolicy(PreTrainedPolicy):
     without recall) and `recall.events` show what happened.
 
     **Training** with stock `lerobot-train` goes through two phases, counted in updates and saved with the checkpoint:
-    first the autoencoder (`autoencoder_steps` updates on frames of the batch's episodes), then, with its features
+    first the autoencoder (`autoencoder.steps` updates on frames of the batch's episodes), then, with its features
     computed once and kept, the recurrent network on whole episodes. An item of a batch only *names* an episode.
 
     Args:
@@ -68,51 +66,11 @@ class UFRNNPolicy(PreTrainedPolicy):
     ):
         super().__init__(config)
         config.validate_features()
-        joint_dim = config.action_feature.shape[0]
-        self.image_encoder = ImageEncoder(
-            config.cameras,
-            config.image_size,
-            config.feature_dim,
-            config.conv_channels,
-            config.autoencoder_hidden_dim,
-            config.conv_first_stride,
-        )
-        self.joint_scaler = RangeScaler(joint_dim)
-        self.model = _model_class(config.kernel)(
-            SHLSTM(
-                joint_dim,
-                config.feature_dim * len(config.cameras),
-                config.joint_hidden_dim,
-                config.image_hidden_dim,
-                config.shared_hidden_dim,
-                config.log_variance_range,
-                config.command_target == "action",
-            ),
-            Foresight(
-                config.exploration,
-                NoiseSchedule(config.noise_range, config.noise_unit, config.noise_scale == "log"),
-                config.num_samples,
-                config.horizon,
-                config.horizon_mode == "learned",
-                config.perturbed_states,
-                config.variance_baseline,
-                config.variance_aggregation,
-                config.keep_unperturbed,
-            ),
-        )
-        self.rest = RestDetector(joint_dim)
-        self.recall: Recall | None = None
-        if config.recall:
-            self.recall = Recall(
-                self.model,
-                config.surprise_threshold,
-                config.recall_samples,
-                config.recall_noise,
-                config.recall_horizon,
-                config.recall_commitment,
-                config.recall_memory,
-                self.rest if config.recall_at_rest else None,
-            )
+        self.image_encoder = ImageEncoder(config.cameras, config.autoencoder)
+        self.joint_scaler = RangeScaler(config.joint_dim)
+        self.model = _make_model(config)
+        self.rest = RestDetector(config.joint_dim)
+        self.recall = Recall(self.model, config, self.rest) if config.recall.enabled else None
         # Training noise is a function of this seed and the update, so that a resumed run goes on exactly as if whole.
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
@@ -204,13 +162,13 @@ class UFRNNPolicy(PreTrainedPolicy):
     @property
     def trains_autoencoder(self) -> bool:
         """`bool`: whether training is still in its first phase."""
-        return self.config.autoencoder_path is None and int(self.updates) < self.config.autoencoder_steps
+        return self.config.autoencoder.path is None and int(self.updates) < self.config.autoencoder.steps
 
     def get_optim_params(self) -> list[dict[str, Any]]:
         """Parameter groups; the recurrent network first, so that its learning rate is the one LeRobot logs."""
         return [
             {"params": list(self.model.parameters())},
-            {"params": list(self.image_encoder.parameters()), "lr": self.config.autoencoder_lr},
+            {"params": list(self.image_encoder.parameters()), "lr": self.config.autoencoder.lr},
         ]
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
@@ -234,8 +192,8 @@ class UFRNNPolicy(PreTrainedPolicy):
             )
         if "episode_index" not in batch:
             raise ValueError(f"A training batch must hold 'episode_index' (B,), got {sorted(batch)}.")
-        if int(self.updates) == 0 and self.config.autoencoder_path is not None and self.training:
-            self._load_autoencoder(self.config.autoencoder_path)
+        if int(self.updates) == 0 and self.config.autoencoder.path is not None and self.training:
+            self._load_autoencoder(self.config.autoencoder.path)
         if not self.trains_autoencoder:
             self.episodes.encode()
         indices = batch["episode_index"].flatten().tolist()
@@ -268,8 +226,8 @@ class UFRNNPolicy(PreTrainedPolicy):
         logger.info("Autoencoder done: %d frames encoded; the recurrent network trains now.", len(features))
 
     def _autoencoder_loss(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, dict[str, float]]:
-        config, device = self.config, self.updates.device
-        picks = torch.randint(2**31, (config.autoencoder_batch_size,), generator=generator, device=device).tolist()
+        config, device = self.config.autoencoder, self.updates.device
+        picks = torch.randint(2**31, (config.batch_size,), generator=generator, device=device).tolist()
         errors = []
         for camera, autoencoder in self.image_encoder.by_camera():
             if int(self.updates) == 0 and self.training:
@@ -288,8 +246,8 @@ class UFRNNPolicy(PreTrainedPolicy):
     def _recurrent_loss(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, dict[str, float]]:
         inputs, targets, commands, mask = self._sequences(episodes, generator)
         if self.training:
-            config = self.config
-            inputs = inputs + drifting_noise(inputs, config.input_noise, config.input_noise_correlation, generator)
+            noise = self.config.augmentation
+            inputs = inputs + drifting_noise(inputs, noise.input_noise, noise.input_noise_correlation, generator)
         prediction, trace = self.model(inputs, generator)
         nll = gaussian_nll(targets, prediction.mean, prediction.log_variance).sum(-1)  # (B, L)
         loss = nll[mask].mean()
@@ -313,20 +271,20 @@ class UFRNNPolicy(PreTrainedPolicy):
         if trace is not None:
             # How much calmer the kept future is than the average candidate's: 0 would mean that selection does nothing.
             logs["foresight_gain"] = (1 - trace.final.amin(1) / trace.final.mean(1)).mean().item()
-            if self.config.horizon_mode == "learned":
-                loss = loss + _horizon_loss(prediction, trace, self.config.horizon, mask)
+            if self.config.foresight.horizon_mode == "learned":
+                loss = loss + _horizon_loss(prediction, trace, self.config.foresight.horizon, mask)
         return loss, logs
 
     def _sequences(self, episodes: list[Episode], generator: Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Scaled inputs and targets (B, L, D), commands (B, L, D_j) and the mask (B, L) of the steps that exist."""
         sequences = [self._sequence(episode) for episode in episodes]
-        if self.training and self.config.stall_probability > 0:
-            longest = int(max(len(inputs) for inputs, *_ in sequences) * self.config.stall_stretch)
+        stalls = self.config.augmentation
+        if self.training and stalls.stall_probability > 0:
+            longest = int(max(len(inputs) for inputs, *_ in sequences) * stalls.stall_stretch)
             cpu = torch.Generator().manual_seed(generator.initial_seed())
             for row, values in enumerate(sequences):
-                index = stall_indices(
-                    len(values[0]), self.config.stall_probability, self.config.stall_steps, longest, cpu
-                ).to(values[0].device)
+                index = stall_indices(len(values[0]), stalls.stall_probability, stalls.stall_steps, longest, cpu)
+                index = index.to(values[0].device)
                 sequences[row] = (values[0][index], values[1][index], values[2][index])
         lengths = torch.tensor([len(inputs) for inputs, *_ in sequences], device=self.updates.device)
         inputs, targets, commands = (
@@ -344,7 +302,9 @@ class UFRNNPolicy(PreTrainedPolicy):
         actions = self.joint_scaler.scale(episode.actions.to(device))
         sensed = torch.cat((states, self.image_encoder.scaler.scale(episode.features)), -1)
         if self.training:
-            sensed, actions = (hold_end(values, self.config.hold_end_steps) for values in (sensed, actions))
+            sensed, actions = (
+                hold_end(values, self.config.augmentation.hold_end_steps) for values in (sensed, actions)
+            )
         return sensed[:-1], sensed[1:], actions[:-1]
 
     def _fit_joint_scaler(self, stats: dict[str, dict[str, Tensor]]) -> None:
@@ -378,7 +338,7 @@ class UFRNNPolicy(PreTrainedPolicy):
         if not self.image_encoder.scaler.is_fitted:
             raise ValueError(
                 f"The autoencoder in '{path}' is not trained to its end; take a checkpoint of a run with at least "
-                "`autoencoder_steps` updates."
+                "`autoencoder.steps` updates."
             )
         logger.info("Autoencoder taken over from %s.", path)
 
@@ -395,21 +355,7 @@ def _frames_to_drop(lengths: list[int]) -> int:
 
 
 def _horizon_loss(prediction: Prediction, trace: ForesightTrace, horizon: int, mask: Tensor) -> Tensor:
-    """Teaches the step scalars at which imagined step the kept future was least uncertain.
-
-    Args:
-        prediction (`Prediction`):
-            Predictions over time, (B, L, ...).
-        trace (`ForesightTrace`):
-            What foresight saw at each of the L steps.
-        horizon (`int`):
-            Longest horizon T.
-        mask (`Tensor`):
-            Steps that exist, (B, L).
-
-    Returns:
-        `Tensor`: binary cross-entropy between `sigmoid(step)` and the fraction of the horizon, scalar.
-    """
+    """Teaches the step scalars at which imagined step of T the kept future was least uncertain, as a fraction of T."""
     assert trace.calmest is not None
     calmest = trace.calmest.gather(1, trace.chosen.unsqueeze(1)).squeeze(1)  # (L, B)
     target = (calmest / horizon).T.to(prediction.step)  # (B, L)
@@ -419,17 +365,24 @@ def _horizon_loss(prediction: Prediction, trace: ForesightTrace, horizon: int, m
     return loss.mean(-1)[mask].mean()
 
 
-def _model_class(kernel: str) -> type[UFRNN]:
-    if kernel == "reference":
-        return UFRNN
+def _make_model(config: UFRNNConfig) -> UFRNN:
+    """The recurrent model, compiled where that is asked for and can be had."""
+    if config.kernel == "reference":
+        return UFRNN(config)
     try:
-        from .kernels.unroll import FastUFRNN
+        from .kernels.unroll import FastUFRNN, unsupported
     except ImportError as error:
-        if kernel == "fast":
+        if config.kernel == "fast":
             raise ImportError(
                 f"`kernel=fast` needs Numba, which cannot be imported here ({error}). Install it (`pip install numba`) "
                 "or take --policy.kernel=reference."
             ) from error
         logger.warning("Numba cannot be imported (%s): taking the reference kernel, about ten times slower.", error)
-        return UFRNN
-    return FastUFRNN
+        return UFRNN(config)
+    reason = unsupported(config)
+    if reason is None:
+        return FastUFRNN(config)
+    if config.kernel == "fast":
+        raise ValueError(f"`kernel=fast` does not compile {reason}; take --policy.kernel=auto or reference.")
+    logger.info("The compiled kernel does not have %s: taking the reference kernel, about ten times slower.", reason)
+    return UFRNN(config)

@@ -2,9 +2,11 @@
 
 `python -m env_door.twin` runs one; `TwinProcess` runs one for a test. A client cannot tell it from a robot by its
 protocols: `ur_rtde`'s interfaces, sockets of the gripper's URCap and LeRobot's `zmq` camera connect to it.
+
+Reading order: `server` and `ports` (the clock, and who is served) -> `rtde`, `script`, `gripper`, `camera` (protocols)
+-> `controller`, `motion`, `live_door` (what they act on) -> `injections` (what can be made to fail).
 """
 
-from env_door.twin.client import TwinClient, TwinError
-from env_door.twin.process import TwinProcess, free_address
+from env_door.twin.client import TwinClient, TwinError, TwinProcess, free_address
 
 __all__ = ["TwinClient", "TwinError", "TwinProcess", "free_address"]

@@ -1,44 +1,52 @@
 """`python -m env_door.twin --address=127.0.0.2 --kind=random --seed=0` runs until Ctrl-C or SIGTERM."""
 
+import asyncio
+import contextlib
 import logging
+import selectors
 import signal
 import sys
 
 import draccus
 from draccus.utils import ParsingError
 
+from env_door.twin.client import READY
 from env_door.twin.configuration import TwinConfig
-from env_door.twin.process import READY
-from env_door.twin.twin import Twin
+from env_door.twin.server import Twin
 
 logger = logging.getLogger("env_door.twin")
 
 
-def main() -> None:
-    """Runs a twin."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+async def run() -> None:
+    """Runs a twin until it is told to stop."""
     try:
         config = draccus.parse(TwinConfig)
         twin = Twin(config)
+        await twin.open()
     except ParsingError as error:
-        # Draccus wraps what the configuration says.
-        sys.exit(f"env_door.twin: {error.__cause__ or error}")
+        sys.exit(f"env_door.twin: {error.__cause__ or error}")  # draccus wraps what the configuration says
     except (ValueError, OSError, ModuleNotFoundError, RuntimeError) as error:
         sys.exit(f"env_door.twin: {error}")
-
-    def stop(*_: object) -> None:
-        twin.stopping = True
-
-    signal.signal(signal.SIGTERM, stop)
-    signal.signal(signal.SIGINT, stop)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, twin.stopped.set)
     if config.until_stdin_closes:
-        twin.hub.watch_end(sys.stdin.fileno(), stop)
+        loop.add_reader(sys.stdin, twin.stopped.set)
     logger.info("listening on %s; %s", config.address, twin.controller.describe())
     print(READY, flush=True)
-    try:
-        twin.run()
-    finally:
-        twin.close()
+    with contextlib.closing(twin):
+        await twin.run()
+
+
+def loop_with_exact_timers() -> asyncio.AbstractEventLoop:
+    """A loop whose selector, unlike the default one, does not wait in whole milliseconds: ticks come in time."""
+    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+
+
+def main() -> None:
+    """Runs the command."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    asyncio.run(run(), loop_factory=loop_with_exact_timers)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ import json
 import multiprocessing
 import signal
 import time
-from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
@@ -21,12 +20,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from env_door.rendering import Renderer, make_renderer
+from env_door.rendering import make_renderer
 from env_door.scene import load_model
+from env_door.twin import ports
 
+NAME = "front"  # of the camera in the scene and in the messages
 WIDTH, HEIGHT = 640, 480
 JPEG_QUALITY = 90
 START_SECONDS = 60.0
+MODE, DRAWN, OFFSET, POSE = 0, 1, 2, slice(3, None)  # where both processes find what they share
 
 try:
     import zmq
@@ -43,104 +45,47 @@ class CameraMode(IntEnum):
     GONE = 3
 
 
-@dataclass
-class CameraOptions:
-    """How the camera works.
-
-    Args:
-        address (`str`):
-            Address on which it publishes.
-        port (`int`):
-            Port on which it publishes.
-        fps (`float`):
-            Pictures a second, as far as the machine can draw them.
-        name (`str`):
-            Name of the camera in the scene and in the messages.
-    """
-
-    address: str
-    port: int = 5555
-    fps: float = 30.0
-    name: str = "front"
-
-
-@dataclass
-class _Shared:
-    """What both processes see. No lock: a pose mixed from two moments 2 ms apart is only a rolling shutter."""
-
-    pose: Any
-    mode: Any
-    drawn: Any
-    doorway: Any = field(default=None)
-
-
 class Camera:
-    """The camera as the twin's process sees it.
+    """The camera as the twin's process sees it, of a scene with so many joint positions (`nq`)."""
 
-    Args:
-        options (`CameraOptions`):
-            How it works.
-        num_positions (`int`):
-            Number of joint positions of the scene (`nq`).
-
-    Raises:
-        ModuleNotFoundError: If pyzmq is missing.
-    """
-
-    def __init__(self, options: CameraOptions, num_positions: int):
+    def __init__(self, address: str, fps: float, num_positions: int):
         if zmq is None:
             raise ModuleNotFoundError(
                 "the twin's camera needs pyzmq: pip install 'lerobot[pyzmq-dep]', or start the twin with --camera=false"
             )
         context = multiprocessing.get_context("spawn")
-        self._shared = _Shared(
-            pose=context.RawArray("d", num_positions),
-            mode=context.RawValue("i", CameraMode.NORMAL),
-            drawn=context.RawValue("l", 0),
-            doorway=context.RawArray("d", 3),
-        )
-        self._pose = np.frombuffer(self._shared.pose)
-        self._doorway = np.frombuffer(self._shared.doorway)
-        self._answer, ours = context.Pipe(duplex=False)
-        self._process = context.Process(target=_run, args=(options, self._shared, ours), daemon=True)
+        # No lock: a pose mixed from two moments 2 ms apart is only a rolling shutter.
+        shared = context.RawArray("d", POSE.start + num_positions)
+        self._shared = np.frombuffer(shared)
+        self._answer, theirs = context.Pipe(duplex=False)
+        endpoint = f"tcp://{address}:{ports.CAMERA}"
+        self._process = context.Process(target=_run, args=(endpoint, fps, shared, theirs), daemon=True)
 
     def start(self) -> None:
-        """Starts the process and waits until it publishes.
-
-        Raises:
-            RuntimeError: If it does not.
-        """
+        """Starts the process and waits until it publishes; raises a RuntimeError if it does not."""
         self._process.start()
         problem = self._answer.recv() if self._answer.poll(START_SECONDS) else "it did not answer"
         if problem is not None:
             self.close()
             raise RuntimeError(f"the twin's camera did not start: {problem}")
 
-    def show(self, pose: NDArray[np.float64], doorway: NDArray[np.float64]) -> None:
-        """Tells where everything is now.
-
-        Args:
-            pose (`NDArray[np.float64]`):
-                The scene's joint positions, shape `(nq,)`.
-            doorway (`NDArray[np.float64]`):
-                Where the doorway stands in m, shape `(3,)`.
-        """
-        self._pose[:] = pose
-        self._doorway[:] = doorway
+    def show(self, pose: NDArray[np.float64], door_offset: float) -> None:
+        """Tells where everything is now: the scene's joint positions, and the door's sideways shift in m."""
+        self._shared[POSE], self._shared[OFFSET] = pose, door_offset
 
     @property
     def mode(self) -> CameraMode:
-        """`CameraMode`: what the camera does."""
-        return CameraMode(self._shared.mode.value)
+        """What the camera does."""
+        return CameraMode(self._shared[MODE])
 
     @mode.setter
     def mode(self, mode: CameraMode) -> None:
-        self._shared.mode.value = int(mode)
+        self._shared[MODE] = mode
 
     @property
     def drawn(self) -> int:
-        """`int`: pictures drawn so far."""
-        return self._shared.drawn.value
+        """Pictures drawn so far."""
+        return int(self._shared[DRAWN])
 
     def close(self) -> None:
         """Ends the process."""
@@ -150,66 +95,53 @@ class Camera:
 
 
 class _View:
-    """Draws 640x480 pixels with renderers that only draw squares."""
+    """Draws 640x480 pixels with a renderer that only draws squares."""
 
-    def __init__(self, camera: str):
+    def __init__(self) -> None:
         self._model = load_model("ur5e")
         self._data = mujoco.MjData(self._model)
         self._doorway = int(self._model.body("doorway").id)
+        self._home = float(self._model.body_pos[self._doorway, 1])
         # A square as wide as the picture, whose middle rows have the camera's own field of view.
-        index = int(self._model.camera(camera).id)
+        index = int(self._model.camera(NAME).id)
         half = np.tan(np.radians(self._model.cam_fovy[index]) / 2) * WIDTH / HEIGHT
         self._model.cam_fovy[index] = 2 * np.degrees(np.arctan(half))
-        self._renderer: Renderer = make_renderer(self._model, camera, WIDTH)
+        self._renderer = make_renderer(self._model, NAME, WIDTH)
 
-    def draw(self, pose: NDArray[np.float64], doorway: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Picture of a pose, shape `(480, 640, 3)`."""
+    def draw(self, pose: NDArray[np.float64], door_offset: float) -> NDArray[np.uint8]:
         self._data.qpos[:] = pose
-        self._model.body_pos[self._doorway] = doorway
+        self._model.body_pos[self._doorway, 1] = self._home + door_offset
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         margin = (WIDTH - HEIGHT) // 2
         return self._renderer.draw(self._data)[margin : margin + HEIGHT]
 
 
-def encode(picture: NDArray[np.uint8], name: str, timestamp: float) -> bytes:
-    """A message as LeRobot's `zmq` camera reads it.
-
-    Args:
-        picture (`NDArray[np.uint8]`):
-            The picture, red first, shape `(height, width, 3)`.
-        name (`str`):
-            Name of the camera.
-        timestamp (`float`):
-            Time of the picture in s.
-
-    Returns:
-        `bytes`: JSON with the picture as JPEG in base64.
-    """
+def encode(picture: NDArray[np.uint8], timestamp: float) -> bytes:
+    """A message as LeRobot's `zmq` camera reads it: JSON with a picture, red first, as JPEG in base64."""
     # OpenCV takes blue first, and neither LeRobot's image server nor its camera swaps: colours come out right
     # because both ends leave them alone.
     _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    message = {"timestamps": {name: timestamp}, "images": {name: base64.b64encode(jpeg.tobytes()).decode()}}
+    message = {"timestamps": {NAME: timestamp}, "images": {NAME: base64.b64encode(jpeg.tobytes()).decode()}}
     return json.dumps(message).encode()
 
 
-def _run(options: CameraOptions, shared: _Shared, answer: Any) -> None:
+def _run(endpoint: str, fps: float, raw: Any, answer: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    endpoint = f"tcp://{options.address}:{options.port}"
     context = zmq.Context()
     try:
         socket = _bind(context, endpoint)
-        view = _View(options.name)
+        view = _View()
     except Exception as error:
         answer.send(f"{endpoint}: {error}")
         return
     answer.send(None)
-    pose, doorway = np.frombuffer(shared.pose), np.frombuffer(shared.doorway)
+    shared = np.frombuffer(raw)
     parent = multiprocessing.parent_process()
     watched, message = False, b""
     due = time.monotonic()
     while parent is not None and parent.is_alive():
-        mode = CameraMode(shared.mode.value)
+        mode = CameraMode(shared[MODE])
         if (mode == CameraMode.GONE) != (socket is None):
             if socket is not None:
                 socket.close(linger=0)
@@ -219,12 +151,12 @@ def _run(options: CameraOptions, shared: _Shared, answer: Any) -> None:
             watched = socket.recv()[:1] == b"\x01"
         if socket is not None and watched:
             if mode == CameraMode.BLACK:
-                message = encode(np.zeros((HEIGHT, WIDTH, 3), np.uint8), options.name, time.time())
+                message = encode(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.time())
             elif mode == CameraMode.NORMAL or not message:
-                message = encode(view.draw(pose.copy(), doorway.copy()), options.name, time.time())
-                shared.drawn.value += 1
+                message = encode(view.draw(shared[POSE], shared[OFFSET]), time.time())
+                shared[DRAWN] += 1
             socket.send(message)
-        due = max(due + 1 / options.fps, time.monotonic())
+        due = max(due + 1 / fps, time.monotonic())
         time.sleep(max(0.0, due - time.monotonic()))
 
 

@@ -1,37 +1,63 @@
-"""The robot controller: power, safety, the program that runs, and one tick of 2 ms.
+"""The robot's controller: power, safety, registers, the program that runs, one tick of 2 ms, and the pendant.
 
 What a client sees of it are modes and bits whose values are Universal Robots' own. A protective stop pauses the program
 and waits for somebody to unlock it; an emergency stop and a loss of power end it.
 """
 
+import asyncio
 import logging
 from collections.abc import Callable, Iterator
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from env_door.twin.gripper import Gripper
+from env_door.twin.gripper import GripperModel
 from env_door.twin.live_door import LiveDoor
-from env_door.twin.modes import ProgramState, RobotMode, SafetyMode
 from env_door.twin.motion import TIME_STEP, JointMotion
-from env_door.twin.registers import Registers
+from env_door.twin.ports import lines
 
 logger = logging.getLogger(__name__)
 
-DEVIATION_LIMIT = 0.5
-"""Distance in rad between target and measured joint at which the controller makes a protective stop."""
+DEVIATION_LIMIT = 0.5  # rad between target and measured joint at which the controller makes a protective stop
+STOP_DECELERATION = 10.0  # rad/s^2 when a program ends while the arm moves
+POWER_SECONDS = 0.3  # that switching on and releasing the brakes take each; some seconds on a real arm
+START_SECONDS = 0.02  # between the upload of a program and its start
+TOOL_POINT = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)  # tool centre point in the flange's frame: between the pads
 
-STOP_DECELERATION = 10.0
-"""Joint deceleration in rad/s^2 when a program ends while the arm moves."""
+STILL_LOCKED = (
+    "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking"
+)
 
-POWER_SECONDS = 0.3
-"""Time that switching on and releasing the brakes take each; some seconds on a real arm."""
+VERSION = (5, 15, 0, 126271)  # of the controller's software that clients are told
+REGISTERS = [
+    f"{way}_{kind}_register_{i}" for way in ("input", "output") for kind in ("int", "double") for i in range(48)
+]
 
-START_SECONDS = 0.02
-"""Time between the upload of a program and its start."""
 
-TOOL_POINT = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
-"""Tool centre point in the flange's frame: between the pads."""
+class RobotMode(IntEnum):
+    """What the arm is ready for."""
+
+    BOOTING = 2
+    POWER_OFF = 3
+    IDLE = 5
+    RUNNING = 7
+
+
+class SafetyMode(IntEnum):
+    """Why the arm may not move."""
+
+    NORMAL = 1
+    PROTECTIVE_STOP = 3
+    ROBOT_EMERGENCY_STOP = 7
+
+
+class ProgramState(IntEnum):
+    """RTDE's `runtime_state`."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSED = 4
 
 
 class ScriptError(Exception):
@@ -41,145 +67,107 @@ class ScriptError(Exception):
 class Controller:
     """State of the controller, the arm's motion, the gripper and the scene.
 
-    Args:
-        door (`LiveDoor`):
-            The scene.
-        unlock_seconds (`float`, *optional*, defaults to `5.0`):
-            Time in s after a protective stop before it can be unlocked.
+    Attributes:
+        registers (`dict[str, float]`):
+            The letter box between a client and the program, by RTDE's names. As on a real controller registers keep
+            their values when a client leaves.
+        written (`dict[str, float]`): Time in s at which an input register was last written.
     """
 
-    def __init__(self, door: LiveDoor, unlock_seconds: float = 5.0):
+    def __init__(self, door: LiveDoor, unlock_seconds: float):
         self.door = door
-        self.gripper = Gripper()
-        self.registers = Registers()
+        self.gripper = GripperModel()
         self.motion = JointMotion(door.joint_low, door.joint_high, np.array(door.arm.joint_speed))
+        self.registers: dict[str, float] = dict.fromkeys(REGISTERS, 0)
+        self.written: dict[str, float] = {}
         self.tool_offset: NDArray[np.float64] = np.array(TOOL_POINT)
         self.time = 0.0
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
         self.program_state = ProgramState.STOPPED
         self.remote_control = True
+        self.watchdog: tuple[str, float] | None = None  # an input, and the longest time between two writes of it
         self._unlock_seconds = unlock_seconds
         self._stopped_at = 0.0
         self._program: Iterator[None] | None = None
         self._starting: tuple[float, Iterator[None]] | None = None
-        self._watchdog: tuple[str, float] | None = None
         self._switching: tuple[float, Callable[[], None]] | None = None
         self._ticks = 0
         self.gripper.switch_on(0.0)
         self.settle()
 
     @property
-    def robot_status_bits(self) -> int:
-        """`int`: RTDE's `robot_status_bits`: power and running program."""
-        powered = self.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING)
-        return int(powered) | int(self.program_state == ProgramState.PLAYING) << 1
-
-    @property
-    def watchdog_armed(self) -> bool:
-        """`bool`: whether the program has armed a watchdog."""
-        return self._watchdog is not None
+    def may_move(self) -> bool:
+        """Whether power and safety let a program move the arm."""
+        return self.robot_mode == RobotMode.RUNNING and self.safety_mode == SafetyMode.NORMAL
 
     def settle(self) -> None:
         """Makes the measured pose the target: after a new trial, and when brakes close."""
         self.motion.hold(self.door.joints)
 
     def tick(self) -> None:
-        """Goes on by 2 ms.
-
-        Raises:
-            RuntimeError: If the physics diverged.
-        """
+        """Goes on by 2 ms; raises a RuntimeError if the physics diverged."""
         self._ticks += 1
         self.time = self._ticks * TIME_STEP
-        self._finish_switching()
+        if self._switching is not None and self.time >= self._switching[0]:
+            finish, self._switching = self._switching[1], None
+            finish()
         self._watch()
         self._run_program()
         self.motion.step()
         self.gripper.step(self.door.closure, TIME_STEP)
-        self.door.tick(self.motion.position, self.motion.velocity, self.gripper.target)
-        if self._ticks % 10 == 0:
-            self.door.limit_grip(self.gripper.force)
-            self._check_deviation()
-            self.door.check()
+        self.door.tick(self.motion.position, self.motion.velocity, self.gripper.target, self.gripper.force)
+        deviation = np.abs(self.motion.position - self.door.joints)
+        if deviation.max() > DEVIATION_LIMIT:
+            joint = self.door.arm.joints[int(deviation.argmax())]
+            self.protective_stop(f"{joint} is {deviation.max():.2f} rad off its target")
 
-    def start_program(self, program: Iterator[None], name: str) -> bool:
-        """Starts a program in the place of the one that may be running.
+    def write_input(self, name: str, value: float) -> None:
+        """Takes what a client writes; what is no register has no effect."""
+        if name in self.registers:
+            self.registers[name] = value
+            self.written[name] = self.time
 
-        Args:
-            program (`Iterator[None]`):
-                The program; it is advanced by one step every 2 ms.
-            name (`str`):
-                Its name, for the log.
-
-        Returns:
-            `bool`: whether the controller takes it: only in remote control, switched on and not stopped by safety.
-        """
-        if not (self.remote_control and self.may_move):
+    def start_program(self, program: Iterator[None], name: str) -> None:
+        """Starts a program, which is advanced every 2 ms, in the place of another, if the arm may be controlled."""
+        if self.remote_control and self.may_move:
+            self.stop_program()
+            self._starting = (self.time + START_SECONDS, program)
+            logger.info("program %s taken", name)
+        else:
             logger.info("program %s refused: %s", name, self.describe())
-            return False
-        self.stop_program()
-        self._starting = (self.time + START_SECONDS, program)
-        logger.info("program %s taken", name)
-        return True
 
     def stop_program(self) -> None:
-        """Ends the running program; a moving arm brakes. Watchdogs end with it, as on the controller."""
-        self._program = self._watchdog = self._starting = None
+        """Ends the running program; a moving arm brakes. Watchdogs end with it, as on a real controller."""
+        self._program = self.watchdog = self._starting = None
         self.program_state = ProgramState.STOPPED
         self.motion.stop(STOP_DECELERATION)
 
     def play(self) -> bool:
-        """Resumes a paused program.
-
-        Returns:
-            `bool`: whether there was one and it may run.
-        """
+        """Resumes a paused program; whether there was one and it may run."""
         if self.program_state != ProgramState.PAUSED or not self.may_move:
             return False
         self.program_state = ProgramState.PLAYING
-        # A program that resumes must not take a pause for a client that has fallen silent.
-        if self._watchdog is not None:
-            self.registers.updated[self._watchdog[0]] = self.time
+        if self.watchdog is not None:  # it must not take the pause for a client that has fallen silent
+            self.written[self.watchdog[0]] = self.time
         return True
 
     def pause(self) -> bool:
-        """Pauses the running program.
-
-        Returns:
-            `bool`: whether one was running.
-        """
+        """Pauses the running program; whether one was running."""
         if self.program_state != ProgramState.PLAYING:
             return False
         self.program_state = ProgramState.PAUSED
         self.motion.stop(STOP_DECELERATION)
         return True
 
-    @property
-    def may_move(self) -> bool:
-        """`bool`: whether power and safety let a program move the arm."""
-        return self.robot_mode == RobotMode.RUNNING and self.safety_mode == SafetyMode.NORMAL
-
     def arm_watchdog(self, name: str, min_frequency: float) -> None:
-        """Ends the program once an input has not been written for too long.
-
-        Args:
-            name (`str`):
-                The RTDE input to watch.
-            min_frequency (`float`):
-                How often it must be written, in Hz; 0 watches no more.
-        """
-        self._watchdog = (name, 1.0 / min_frequency) if min_frequency > 0 else None
-        self.registers.updated[name] = self.time
+        """Ends the program once an input is written less often than so many times a second; 0 watches no more."""
+        self.watchdog = (name, 1.0 / min_frequency) if min_frequency > 0 else None
+        self.written[name] = self.time
 
     def protective_stop(self, reason: str) -> None:
-        """Stops at once, pauses the program and waits to be unlocked.
-
-        Args:
-            reason (`str`):
-                Why, for the log.
-        """
-        if self.safety_mode == SafetyMode.NORMAL and self.robot_mode == RobotMode.RUNNING:
+        """Stops at once, pauses the program and waits to be unlocked."""
+        if self.may_move:
             logger.warning("protective stop: %s", reason)
             self.pause()
             self._starting = None
@@ -187,16 +175,11 @@ class Controller:
             self.settle()
 
     def unlock(self) -> bool:
-        """Ends a protective stop.
-
-        Returns:
-            `bool`: whether it could be ended: not before the waiting time is over.
-        """
-        if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
-            return True
-        if self.time - self._stopped_at < self._unlock_seconds:
-            return False
-        self.safety_mode = SafetyMode.NORMAL
+        """Ends a protective stop; whether it could be ended: not before the waiting time is over."""
+        if self.safety_mode == SafetyMode.PROTECTIVE_STOP:
+            if self.time - self._stopped_at < self._unlock_seconds:
+                return False
+            self.safety_mode = SafetyMode.NORMAL
         return True
 
     def press_emergency_stop(self) -> None:
@@ -219,49 +202,37 @@ class Controller:
 
     def power_on(self) -> None:
         """Switches the arm on, with brakes closed; without effect during an emergency stop."""
+
+        def finish() -> None:
+            self.robot_mode = RobotMode.IDLE
+            self.gripper.switch_on(self.door.closure)
+
         if self.robot_mode == RobotMode.POWER_OFF and self.safety_mode == SafetyMode.NORMAL:
             self.robot_mode = RobotMode.BOOTING
-            self._switching = (self.time + POWER_SECONDS, self._become_idle)
+            self._switching = (self.time + POWER_SECONDS, finish)
 
     def release_brakes(self) -> None:
         """Releases the brakes of an arm that is switched on."""
+
+        def finish() -> None:
+            self.robot_mode = RobotMode.RUNNING
+            self.settle()
+
         if self.robot_mode == RobotMode.IDLE and self.safety_mode == SafetyMode.NORMAL:
-            self._switching = (self.time + POWER_SECONDS, self._become_running)
+            self._switching = (self.time + POWER_SECONDS, finish)
 
     def describe(self) -> str:
-        """What the controller is in, for logs and errors.
-
-        Returns:
-            `str`: modes in words.
-        """
-        control = "remote" if self.remote_control else "local"
-        return (
-            f"robot {self.robot_mode.name}, safety {self.safety_mode.name}, program {self.program_state.name}, "
-            f"{control} control"
-        )
-
-    def _become_idle(self) -> None:
-        self.robot_mode = RobotMode.IDLE
-        self.gripper.switch_on(self.door.closure)
-
-    def _become_running(self) -> None:
-        self.robot_mode = RobotMode.RUNNING
-        self.settle()
-
-    def _finish_switching(self) -> None:
-        if self._switching is not None and self.time >= self._switching[0]:
-            finish = self._switching[1]
-            self._switching = None
-            finish()
+        """What the controller is in, for logs."""
+        modes = f"robot {self.robot_mode.name}, safety {self.safety_mode.name}, program {self.program_state.name}"
+        return f"{modes}, {'remote' if self.remote_control else 'local'} control"
 
     def _watch(self) -> None:
-        if self._watchdog is None or self.program_state != ProgramState.PLAYING:
-            return
-        name, longest = self._watchdog
-        silence = self.time - self.registers.updated.get(name, 0.0)
-        if silence > longest:
-            logger.warning("watchdog: %s not written for %.3f s; the program ends", name, silence)
-            self.stop_program()
+        if self.watchdog is not None and self.program_state == ProgramState.PLAYING:
+            name, longest = self.watchdog
+            silence = self.time - self.written[name]
+            if silence > longest:
+                logger.warning("watchdog: %s not written for %.3f s; the program ends", name, silence)
+                self.stop_program()
 
     def _run_program(self) -> None:
         if self._starting is not None and self.time >= self._starting[0]:
@@ -271,14 +242,57 @@ class Controller:
             return
         try:
             next(self._program)
-        except StopIteration:
-            self.stop_program()
-        except ScriptError as error:
-            logger.error("the program ends: %s", error)
+        except (StopIteration, ScriptError) as end:
+            if isinstance(end, ScriptError):
+                logger.error("the program ends: %s", end)
             self.stop_program()
 
-    def _check_deviation(self) -> None:
-        deviation = np.abs(self.motion.position - self.door.joints)
-        if deviation.max() > DEVIATION_LIMIT:
-            joint = self.door.arm.joints[int(deviation.argmax())]
-            self.protective_stop(f"{joint} is {deviation.max():.2f} rad off its target")
+
+class Dashboard:
+    """The dashboard server on port 29999: what a person does on the teach pendant, as lines of text.
+
+    Replies are those of an e-Series controller, which clients compare letter by letter.
+    """
+
+    def __init__(self, controller: Controller):
+        self._controller = controller
+        # What is done, and the answers to what was done and to what could not be. A controller in local control leaves
+        # all of it to the person in front of it. Clients take any answer to `stop` but this one for a failure.
+        self._actions: dict[str, tuple[Callable[[], bool | None], str, str]] = {
+            "play": (controller.play, "Starting program", "Failed to execute: play"),
+            "pause": (controller.pause, "Pausing program", "Failed to execute: pause"),
+            "stop": (controller.stop_program, "Stopped", ""),
+            "unlock protective stop": (controller.unlock, "Protective stop releasing", STILL_LOCKED),
+            "power on": (controller.power_on, "Powering on", ""),
+            "power off": (controller.power_off, "Powering off", ""),
+            "brake release": (controller.release_brakes, "Brake releasing", ""),
+        }
+        self._questions: dict[str, Callable[[], str]] = {
+            "running": lambda: f"Program running: {str(controller.program_state == ProgramState.PLAYING).lower()}",
+            "programstate": lambda: f"{controller.program_state.name} <unnamed>",
+            "robotmode": lambda: f"Robotmode: {controller.robot_mode.name}",
+            "safetymode": lambda: f"Safetymode: {controller.safety_mode.name}",
+            "safetystatus": lambda: f"Safetystatus: {controller.safety_mode.name}",
+            "is in remote control": lambda: str(controller.remote_control).lower(),
+            "close safety popup": lambda: "closing safety popup",
+            "get serial number": lambda: "20235500001",  # without which ur_rtde's control does not connect
+            "polyscopeversion": lambda: f"URSoftware {'.'.join(map(str, VERSION))} (Oct 15 2023)",
+        }
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Carries out the commands of one client."""
+        writer.write(b"Connected: Universal Robots Dashboard Server\n")
+        async for line in lines(reader):
+            if line.lower() == "quit":
+                writer.write(b"Disconnected\n")
+                return
+            writer.write(f"{self._answer(line)}\n".encode())
+
+    def _answer(self, line: str) -> str:
+        command = line.lower()
+        if command in self._actions:
+            if not self._controller.remote_control:
+                return f"Failed to execute: {command}"
+            action, done, failed = self._actions[command]
+            return failed if action() is False else done
+        return self._questions.get(command, lambda: f"could not understand: '{line}'")()

@@ -4,43 +4,26 @@ The fingers go at the speed that was set towards the position that was asked for
 squeezing with the force that was set. It reads 3 when it is open and 230 when it is closed, as a real one does roughly.
 """
 
-from env_door.twin.lines import LinePeer
-from env_door.twin.network import Connection
+import asyncio
 
-OPEN, CLOSED = 3, 230
-"""Positions, of 0 to 255, at the ends of the stroke; what is asked for beyond them leads to the end."""
+from env_door.twin.ports import lines
 
-STROKE_SPEEDS = (0.235, 1.765)
-"""Slowest and fastest closing in strokes per second (20 and 150 mm/s of 85 mm)."""
+OPEN, CLOSED = 3, 230  # positions, of 0 to 255, at the ends of the stroke; what is asked for beyond leads to the end
+STROKE_SPEEDS = (0.235, 1.765)  # slowest and fastest closing in strokes per second (20 and 150 mm/s of 85 mm)
+FORCES = (20.0, 235.0)  # weakest and strongest grip in N
+ACTIVATION_SECONDS = 1.0  # the real gripper closes and opens meanwhile; this one only opens
+BLOCKED_SECONDS = 0.06  # for which the fingers must stand short of the target to count as stopped by an object
 
-FORCES = (20.0, 235.0)
-"""Weakest and strongest grip in N; the scene's gripper ends at 140 N."""
-
-ACTIVATION_SECONDS = 1.0
-"""Time that activation takes. The real gripper closes and opens meanwhile; this one only opens."""
-
-BLOCKED_SECONDS = 0.06
-"""Time for which the fingers must stand still short of the target to count as stopped by an object."""
-
-NOT_ACTIVATED = 7
-"""Fault: asked to move before it was activated. Ends with activation."""
-
-ACTIVATING_FAULT = 5
-"""Fault: asked to move while it is being activated. Ends with activation, after which it moves."""
-
-MAJOR_FAULT = 10
-"""Faults from here on stop the gripper until it is activated again (`SET ACT 0`, then `SET ACT 1`)."""
+# Faults; those of activation end with it.
+ACTIVATING_FAULT = 5  # asked to move while it is being activated, after which it moves
+NOT_ACTIVATED = 7  # asked to move before it was activated
+MAJOR_FAULT = 10  # from here on they stop the gripper until it is activated again (`SET ACT 0`, then `SET ACT 1`)
 
 RESET, ACTIVATING, ACTIVE = 0, 1, 3
 MOVING, BLOCKED_OPENING, BLOCKED_CLOSING, AT_TARGET = 0, 1, 2, 3
 
 
-def closure_at(position: int) -> float:
-    """Closure, 0 open to 1 closed, at a position of 0 to 255."""
-    return min(max((position - OPEN) / (CLOSED - OPEN), 0.0), 1.0)
-
-
-class Gripper:
+class GripperModel:
     """The gripper's variables and the closure it drives its fingers to.
 
     Attributes:
@@ -64,12 +47,7 @@ class Gripper:
         self.target = self._measured = 0.0
 
     def switch_on(self, closure: float) -> None:
-        """Gives it power again.
-
-        Args:
-            closure (`float`):
-                Measured closure, where the fingers stay.
-        """
+        """Gives it power again; the fingers stay where they are."""
         self.powered = True
         self.target = self._measured = closure
 
@@ -80,29 +58,17 @@ class Gripper:
 
     @property
     def force(self) -> float:
-        """`float`: force in N with which it squeezes."""
+        """Force in N with which it squeezes."""
         return FORCES[0] + (FORCES[1] - FORCES[0]) * self._set["FOR"] / 255
 
     def fail(self, code: int) -> None:
-        """Breaks it.
-
-        Args:
-            code (`int`):
-                Fault that it shows, 1 to 15; 0 takes the cause away, though a major fault lasts until it is activated.
-        """
+        """Breaks it with a fault of 1 to 15; 0 takes the cause away, though a major fault lasts until activation."""
         self.cause = code
         if code or self._fault < MAJOR_FAULT:
             self._fault = code
 
     def step(self, closure: float, seconds: float) -> None:
-        """Goes on in time.
-
-        Args:
-            closure (`float`):
-                Measured closure, 0 open to 1 closed.
-            seconds (`float`):
-                Time since the last step in s.
-        """
+        """Goes on in time, with a measured closure of 0 open to 1 closed."""
         moved, self._measured = abs(closure - self._measured), closure
         if self._status == ACTIVATING:
             self._activating -= seconds
@@ -110,9 +76,13 @@ class Gripper:
             if self._activating <= 0:
                 self._status, self._fault = ACTIVE, self.cause
         elif self._status == ACTIVE and self._set["GTO"] and self._fault < MAJOR_FAULT:
-            self._approach(closure_at(self._set["POS"]), seconds)
+            self._approach(self._goal, seconds)
         self._still = self._still + seconds if moved < 0.02 * seconds else 0.0
         self._object = self._detect(closure)
+
+    @property
+    def _goal(self) -> float:
+        return min(max((self._set["POS"] - OPEN) / (CLOSED - OPEN), 0.0), 1.0)
 
     def _approach(self, goal: float, seconds: float) -> None:
         slow, fast = STROKE_SPEEDS
@@ -120,10 +90,9 @@ class Gripper:
         self.target += min(max(goal - self.target, -step), step)
 
     def _detect(self, closure: float) -> int:
-        goal = closure_at(self._set["POS"])
         if self._still < BLOCKED_SECONDS or not self._set["GTO"]:
             return MOVING
-        if abs(goal - closure) <= 3 / 255:
+        if abs(self._goal - closure) <= 3 / 255:
             return AT_TARGET
         # Only fingers that push and do not move have met something.
         if abs(self.target - closure) < 0.01:
@@ -131,15 +100,7 @@ class Gripper:
         return BLOCKED_CLOSING if self.target > closure else BLOCKED_OPENING
 
     def get(self, name: str) -> str:
-        """Value of a variable.
-
-        Args:
-            name (`str`):
-                Its three letters.
-
-        Returns:
-            `str`: a whole number, or `"?"` for an unknown variable and while the gripper has no power.
-        """
+        """Value of a variable; `"?"` for an unknown one and while the gripper has no power."""
         if not self.powered:
             return "?"
         status = {
@@ -152,15 +113,7 @@ class Gripper:
         return str((self._set | status).get(name, "?"))
 
     def set(self, values: dict[str, int]) -> bool:
-        """Sets variables.
-
-        Args:
-            values (`dict[str, int]`):
-                New values by name.
-
-        Returns:
-            `bool`: whether they were taken; `False` leaves all as they were.
-        """
+        """Sets variables; whether they were taken: all or none."""
         if not self.powered or not values:
             return False
         if any(name not in self._set or not 0 <= value <= 255 for name, value in values.items()):
@@ -177,45 +130,29 @@ class Gripper:
         elif self._status == ACTIVATING and "POS" in values:
             self._fault = self._fault or ACTIVATING_FAULT
         if "GTO" in values or "POS" in values:
-            self._start_moving()
+            if self._status == RESET and self._set["GTO"]:
+                self._fault = NOT_ACTIVATED
+            elif not self._set["GTO"]:
+                self.target = self._measured
+            self._still, self._object = 0.0, MOVING
         return True
 
-    def _start_moving(self) -> None:
-        if self._status == RESET and self._set["GTO"]:
-            self._fault = NOT_ACTIVATED
-        elif not self._set["GTO"]:
-            self.target = self._measured
-        self._still, self._object = 0.0, MOVING
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answers the requests of one client."""
+        async for line in lines(reader):
+            if not self.silent:
+                writer.write(b"\xff\x00#?!\n" if self.garbage else self.answer(line).encode())
 
-
-class GripperSocket(LinePeer):
-    """The URCap's text protocol: `SET ACT 1 GTO 1 ...` is answered by `ack` and `GET POS` by `POS 3`.
-
-    Args:
-        connection (`Connection`):
-            The connection.
-        gripper (`Gripper`):
-            The gripper.
-    """
-
-    def __init__(self, connection: Connection, gripper: Gripper):
-        super().__init__(connection)
-        self._gripper = gripper
-
-    def line(self, line: str) -> None:
-        """Answers one request."""
-        if self._gripper.silent:
-            return
-        self.connection.send(b"\xff\x00#?!\n" if self._gripper.garbage else self._answer(line.split()).encode())
-
-    def _answer(self, words: list[str]) -> str:
+    def answer(self, line: str) -> str:
+        """Answers a request of the URCap's text protocol: `SET ACT 1 GTO 1` with `ack`, `GET POS` with `POS 3`."""
+        words = line.split()
         if len(words) == 2 and words[0] == "GET":
-            return f"{words[1]} {self._gripper.get(words[1])}\n"
+            return f"{words[1]} {self.get(words[1])}\n"
         if words[:1] == ["SET"] and len(words) % 2:
             try:
                 values = {name: round(float(value)) for name, value in zip(words[1::2], words[2::2], strict=True)}
             except (ValueError, OverflowError):
                 return "?\n"
             # Clients compare with exactly these three letters: no end of line.
-            return "ack" if self._gripper.set(values) else "?\n"
+            return "ack" if self.set(values) else "?\n"
         return "?\n"

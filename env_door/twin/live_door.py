@@ -9,47 +9,23 @@ from numpy.typing import NDArray
 from env_door.env import DoorEnv
 from env_door.kinematics import rotation_about, rotation_vector
 
-GRIP_FORCE = 140.0
-"""Largest force in N with which the gripper of the scene can squeeze."""
+GRIP_FORCE = 140.0  # largest force in N with which the gripper of the scene can squeeze
 
 
 class LiveDoor(DoorEnv):
     """The scene with a UR5e, for a controller that sets a new target every 2 ms.
 
     The targets come from the controller, which has limits of its own: those of `DoorEnv.limit_action` do not apply.
-
-    Args:
-        kind (`str`, *optional*, defaults to `"random"`):
-            As in `DoorEnv`.
-        door_offset (`float`, *optional*, defaults to `0.0`):
-            As in `DoorEnv`.
-        hold_seconds (`float`, *optional*, defaults to `0.0`):
-            As in `DoorEnv`.
     """
 
     def __init__(self, kind: str = "random", door_offset: float = 0.0, hold_seconds: float = 0.0):
         super().__init__(kind=kind, arm="ur5e", door_offset=door_offset, hold_seconds=hold_seconds)
-        joints = [self.model.joint(name) for name in self.arm.joints]
-        self._dofs = np.array([joint.dofadr[0] for joint in joints])
-        self._base = int(self.model.body("base").id)
-        self._flange = int(self.model.body("flange").id)
+        self._dofs = np.array([self.model.joint(name).dofadr[0] for name in self.arm.joints])
+        self._base, self._flange = (int(self.model.body(name).id) for name in ("base", "flange"))
+        self.joint_low, self.joint_high = self._low[:-1], self._high[:-1]
 
     def place(self, seed: int | None, kind: str | None, keep_arm: bool) -> None:
-        """Starts a trial: closes the door and, unless told otherwise, puts the arm in front of it.
-
-        Draws no picture, unlike `reset`.
-
-        Args:
-            seed (`int | None`):
-                Seed of all draws; `None` goes on with the last one's.
-            kind (`str | None`):
-                Kind of the door; `None` for the one given to the constructor.
-            keep_arm (`bool`):
-                Whether arm and fingers stay where they are.
-
-        Raises:
-            ValueError: If the kind is unknown.
-        """
+        """Starts a trial like `reset`, and draws no picture; `keep_arm` leaves arm and fingers where they are."""
         joints, fingers = self.data.qpos[self._qpos].copy(), self.data.qpos[self._fingers].copy()
         super().reset(seed=seed, options={} if kind is None else {"kind": kind})
         if keep_arm:
@@ -60,86 +36,38 @@ class LiveDoor(DoorEnv):
         # The camera is a process of its own: `reset` would draw here only to throw the picture away.
         return {}
 
-    def tick(self, joints: NDArray[np.float64], velocity: NDArray[np.float64], closure: float) -> None:
-        """Moves the scene by one physics step of 2 ms.
-
-        Args:
-            joints (`NDArray[np.float64]`):
-                Joint targets in rad, shape `(6,)`.
-            velocity (`NDArray[np.float64]`):
-                Their velocities in rad/s.
-            closure (`float`):
-                Gripper target, 0 open to 1 closed.
-
-        Raises:
-            RuntimeError: If the physics diverged.
-        """
+    def tick(
+        self, joints: NDArray[np.float64], velocity: NDArray[np.float64], closure: float, grip_force: float
+    ) -> None:
+        """Moves the scene by 2 ms towards joint targets (rad, rad/s); raises a RuntimeError if the physics diverged."""
+        force = min(grip_force, GRIP_FORCE)
+        self.model.actuator_forcerange[self._actuators[-1]] = (-force, force)
         self._step_physics(self._control(np.append(joints, closure), np.append(velocity, 0.0)))
         self._hold_if_due()
-
-    def check(self) -> None:
-        """Looks whether the physics is still sound; too dear for every step.
-
-        Raises:
-            RuntimeError: If the physics diverged.
-        """
         self._check_physics()
-
-    def limit_grip(self, force: float) -> None:
-        """Limits the force with which the gripper squeezes.
-
-        Args:
-            force (`float`):
-                Force in N; the scene's gripper has 140 N at most.
-        """
-        force = min(force, GRIP_FORCE)
-        self.model.actuator_forcerange[self._actuators[-1]] = (-force, force)
 
     @property
     def joints(self) -> NDArray[np.float64]:
-        """`NDArray[np.float64]`: measured joint angles in rad, shape `(6,)`."""
+        """Measured joint angles in rad, shape `(6,)`."""
         return self.data.qpos[self._qpos]
 
     @property
     def joint_speeds(self) -> NDArray[np.float64]:
-        """`NDArray[np.float64]`: measured joint speeds in rad/s, shape `(6,)`."""
+        """Measured joint speeds in rad/s, shape `(6,)`."""
         return self.data.qvel[self._dofs]
 
     @property
     def joint_torques(self) -> NDArray[np.float64]:
-        """`NDArray[np.float64]`: torques of the drives in N m, shape `(6,)`, gravity not counted."""
+        """Torques of the drives in N m, shape `(6,)`, gravity not counted."""
         return self.data.actuator_force[self._actuators[:-1]]
 
     @property
     def closure(self) -> float:
-        """`float`: measured closure of the gripper, 0 open to 1 closed."""
+        """Measured closure of the gripper, 0 open to 1 closed."""
         return float(self.measured_joints()[-1])
 
-    @property
-    def joint_low(self) -> NDArray[np.float64]:
-        """`NDArray[np.float64]`: smallest joint angles in rad, shape `(6,)`."""
-        return self._low[:-1]
-
-    @property
-    def joint_high(self) -> NDArray[np.float64]:
-        """`NDArray[np.float64]`: largest joint angles in rad, shape `(6,)`."""
-        return self._high[:-1]
-
-    @property
-    def doorway(self) -> NDArray[np.float64]:
-        """`NDArray[np.float64]`: where the doorway stands in m, shape `(3,)`."""
-        return self.model.body_pos[self._doorway]
-
     def tool_pose(self, offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pose of the tool centre point in the robot's base frame, as the controller reports it.
-
-        Args:
-            offset (`NDArray[np.float64]`):
-                The tool centre point in the flange's frame: position in m and rotation vector in rad, shape `(6,)`.
-
-        Returns:
-            `NDArray[np.float64]`: position in m and rotation vector in rad, shape `(6,)`.
-        """
+        """Pose in the base frame of a tool centre point in the flange's, both in m and as rotation vector, `(6,)`."""
         to_base = self.data.xmat[self._base].reshape(3, 3).T
         flange = self.data.xmat[self._flange].reshape(3, 3)
         position = self.data.xpos[self._flange] + flange @ offset[:3] - self.data.xpos[self._base]

@@ -14,118 +14,61 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-TIME_STEP = 0.002
-"""Seconds between two targets (500 Hz, the e-Series' own rate)."""
-
-MAX_ACCELERATION = 40.0
-"""Largest joint acceleration in rad/s^2; also the largest that the client lets one ask for."""
-
-STILL = 1e-3
-"""Joint speed in rad/s below which a motion counts as stopped."""
+TIME_STEP = 0.002  # seconds between two targets (500 Hz, the e-Series' own rate)
+MAX_ACCELERATION = 40.0  # of a joint in rad/s^2; also the largest that the client lets one ask for
+STILL = 1e-3  # joint speed in rad/s below which a motion counts as stopped
 
 
 class JointMotion:
-    """The joint target and its velocity, and the one motion that changes them.
+    """The joint target, its velocity (rad, rad/s), and the one motion that changes them.
 
-    Args:
-        low (`NDArray[np.float64]`):
-            Smallest joint angles in rad, shape `(num_joints,)`.
-        high (`NDArray[np.float64]`):
-            Largest joint angles in rad.
-        max_speed (`NDArray[np.float64]`):
-            Largest joint speeds in rad/s.
+    Attributes:
+        kind (`str`): `"hold"`, `"servo"`, `"move"` or `"stop"`.
     """
 
     def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], max_speed: NDArray[np.float64]):
         self._low, self._high, self._max_speed = low, high, max_speed
         self.hold(np.zeros_like(low))
 
-    @property
-    def kind(self) -> str:
-        """`str`: `"hold"`, `"servo"`, `"speed"`, `"move"` or `"stop"`."""
-        return self._kind
-
     def hold(self, position: NDArray[np.float64]) -> None:
-        """Stays somewhere from now on, at once and without a motion.
-
-        Args:
-            position (`NDArray[np.float64]`):
-                Joint angles in rad.
-        """
+        """Stays somewhere from now on, at once and without a motion."""
         self.position = np.array(position, dtype=np.float64)
         self.velocity = np.zeros_like(self.position)
-        self._kind = "hold"
+        self.kind = "hold"
 
     def servo(self, target: NDArray[np.float64], lookahead: float, gain: float) -> None:
-        """Follows a target from now on.
-
-        Args:
-            target (`NDArray[np.float64]`):
-                Joint angles in rad; clipped to the joint ranges.
-            lookahead (`float`):
-                Lookahead time in s.
-            gain (`float`):
-                Gain in 1/s^2.
-        """
+        """Follows a target, within the joint ranges, with a lookahead in s and a gain in 1/s^2."""
         self._goal = np.clip(target, self._low, self._high)
         self._lookahead, self._gain = lookahead, gain
-        self._kind = "servo"
-
-    def speed(self, velocity: NDArray[np.float64], acceleration: float) -> None:
-        """Speeds up to some joint speeds and keeps them.
-
-        Args:
-            velocity (`NDArray[np.float64]`):
-                Joint speeds in rad/s.
-            acceleration (`float`):
-                Acceleration in rad/s^2.
-        """
-        self._goal = np.clip(velocity, -self._max_speed, self._max_speed)
-        self._acceleration = min(acceleration, MAX_ACCELERATION)
-        self._kind = "speed"
+        self.kind = "servo"
 
     def move(self, target: NDArray[np.float64], speed: float, acceleration: float) -> None:
-        """Moves along a straight line in joint space, with a trapezoidal speed, all joints together.
-
-        Args:
-            target (`NDArray[np.float64]`):
-                Joint angles in rad; clipped to the joint ranges.
-            speed (`float`):
-                Speed of the joint with the longest way in rad/s.
-            acceleration (`float`):
-                Its acceleration in rad/s^2.
-        """
+        """Moves on a straight line in joint space; speed and acceleration are of the joint with the longest way."""
         self._start, self._goal = self.position.copy(), np.clip(target, self._low, self._high)
         self._distance = float(np.abs(self._goal - self._start).max())
         self._acceleration = min(max(acceleration, 1e-3), MAX_ACCELERATION)
         # A short way never reaches the speed that was asked for.
-        self._cruise = min(max(speed, 1e-3), float(self._max_speed.min()), math.sqrt(self._distance * acceleration))
+        reachable = math.sqrt(self._distance * self._acceleration)
+        self._cruise = min(max(speed, 1e-3), float(self._max_speed.min()), reachable)
         self._elapsed = 0.0
-        self._kind = "move" if self._distance > 0 else "hold"
+        self.kind = "move" if self._distance > 0 else "hold"
 
     def stop(self, deceleration: float) -> None:
-        """Brakes.
-
-        Args:
-            deceleration (`float`):
-                Deceleration of each joint in rad/s^2.
-        """
+        """Brakes each joint."""
         self._acceleration = min(max(deceleration, 0.1), MAX_ACCELERATION)
-        self._kind = "hold" if not self.velocity.any() else "stop"
+        self.kind = "hold" if not self.velocity.any() else "stop"
 
     def step(self) -> None:
         """Goes on by 2 ms."""
-        if self._kind == "servo":
+        if self.kind == "servo":
             ahead = self.position + self._lookahead * self.velocity
             self._accelerate(self._gain * (self._goal - ahead), MAX_ACCELERATION)
-        elif self._kind == "speed":
-            self._accelerate((self._goal - self.velocity) / TIME_STEP, self._acceleration)
-        elif self._kind == "stop":
+        elif self.kind == "stop":
             self._accelerate(-self.velocity / TIME_STEP, self._acceleration)
             if np.abs(self.velocity).max() < STILL:
                 self.hold(self.position)
-        elif self._kind == "move":
-            self._follow_profile()
+        elif self.kind == "move":
+            self._follow_trapezoid()
 
     def _accelerate(self, acceleration: NDArray[np.float64], limit: float) -> None:
         velocity = self.velocity + np.clip(acceleration, -limit, limit) * TIME_STEP
@@ -134,7 +77,7 @@ class JointMotion:
         self.velocity = (position - self.position) / TIME_STEP
         self.position = position
 
-    def _follow_profile(self) -> None:
+    def _follow_trapezoid(self) -> None:
         self._elapsed += TIME_STEP
         speed, acceleration, distance = self._cruise, self._acceleration, self._distance
         ramp = speed / acceleration

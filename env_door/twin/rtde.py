@@ -2,56 +2,150 @@
 
 A package is a length of two bytes that counts itself, a type of one byte and a body, in network byte order. The client
 first agrees on recipes, lists of variables, and then receives one list of measurements at the rate it asked for.
+Names and types are those of Universal Robots' RTDE guide.
 """
 
+import asyncio
 import logging
 import struct
+import time
 from collections import deque
-from enum import IntEnum
+from collections.abc import Callable
 
-from env_door.twin.controller import Controller
-from env_door.twin.measurements import Reading, readings
+from env_door.twin.controller import REGISTERS, VERSION, Controller, ProgramState, RobotMode, SafetyMode
 from env_door.twin.motion import TIME_STEP
-from env_door.twin.network import Connection
-from env_door.twin.rtde_variables import TYPES, input_type, output_type
 
 logger = logging.getLogger(__name__)
 
-VERSION = (5, 15, 0, 126271)
-"""Version of the controller's software that clients are told."""
-
 HEADER = struct.Struct(">HB")
+MAX_ARRIVALS = 100_000  # times of set-points that are kept: more than 13 minutes
+
+FORMATS = {"UINT8": "B", "UINT32": "I", "UINT64": "Q", "INT32": "i", "DOUBLE": "d"}
+FORMATS |= {"VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i"}
 
 
-class Package(IntEnum):
-    """Types of packages."""
+def _by_name(**names: str) -> dict[str, str]:
+    registers = {name: "INT32" if "_int_" in name else "DOUBLE" for name in REGISTERS}
+    return registers | {name: kind for kind, group in names.items() for name in group.split()}
 
-    PROTOCOL_VERSION = ord("V")
-    CONTROLLER_VERSION = ord("v")
-    DATA = ord("U")
-    OUTPUTS = ord("O")
-    INPUTS = ord("I")
-    START = ord("S")
-    PAUSE = ord("P")
+
+# What a client may ask for; what has no counterpart in the scene reads 0.
+OUTPUTS = _by_name(
+    DOUBLE="""timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum actual_main_voltage
+        actual_robot_voltage actual_robot_current standard_analog_input0 standard_analog_input1 standard_analog_output0
+        standard_analog_output1 payload""",
+    VECTOR6D="""target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current
+        joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose target_TCP_speed
+        joint_temperatures actual_joint_voltage ft_raw_wrench payload_inertia""",
+    VECTOR3D="actual_tool_accelerometer payload_cog",
+    VECTOR6INT32="joint_mode",
+    INT32="robot_mode safety_mode safety_status",
+    UINT32="""runtime_state robot_status_bits safety_status_bits output_bit_registers0_to_31
+        output_bit_registers32_to_63""",
+    UINT64="actual_digital_input_bits actual_digital_output_bits",
+)
+# What a client may write; only registers have an effect.
+INPUTS = _by_name(
+    DOUBLE="speed_slider_fraction standard_analog_output_0 standard_analog_output_1",
+    VECTOR6D="external_force_torque",
+    UINT32="speed_slider_mask input_bit_registers0_to_31 input_bit_registers32_to_63",
+    UINT8="""standard_digital_output_mask standard_digital_output configurable_digital_output_mask
+        configurable_digital_output tool_digital_output_mask tool_digital_output standard_analog_output_mask
+        standard_analog_output_type""",
+)
+INPUTS = {name: kind for name, kind in INPUTS.items() if not name.startswith("output_")}
+
+JOINT_MODES = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255, RobotMode.BOOTING: 247, RobotMode.POWER_OFF: 239}
+SAFETY_BITS = {
+    SafetyMode.NORMAL: 1 << 0,
+    SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
+}
+
+Reading = Callable[[], tuple[float, ...]]
+
+
+class RTDEServer:
+    """All clients of RTDE.
+
+    Attributes:
+        sessions (`set[RTDESession]`): The clients.
+        delay (`float`): Seconds by which measurements reach the clients late.
+        frozen (`bool`): Whether measurements are withheld.
+        arrivals (`deque[float]`): Real time in s, `time.monotonic()`, at which the last inputs came.
+        owners (`dict[str, RTDESession]`): Who writes an input; a second one is refused.
+    """
+
+    def __init__(self, controller: Controller):
+        self.controller = controller
+        self.sessions: set[RTDESession] = set()
+        self.delay = 0.0
+        self.frozen = False
+        self.arrivals: deque[float] = deque(maxlen=MAX_ARRIVALS)
+        self.owners: dict[str, RTDESession] = {}
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answers the packages of one client; hangs up at a malformed one."""
+        session = RTDESession(self, writer)
+        self.sessions.add(session)
+        try:
+            while True:
+                size, kind = HEADER.unpack(await reader.readexactly(HEADER.size))
+                session.handle(chr(kind), await reader.readexactly(size - HEADER.size))
+        except (struct.error, ValueError) as error:
+            logger.warning("RTDE client sent a malformed package (%s): hung up", error)
+        finally:
+            self.sessions.discard(session)
+            self.owners = {name: owner for name, owner in self.owners.items() if owner is not session}
+
+    def take_arrivals(self) -> list[float]:
+        """The times at which inputs came, since this was asked last."""
+        times = list(self.arrivals)
+        self.arrivals.clear()
+        return times
+
+    def publish(self) -> None:
+        """Sends measurements to all clients whose turn it is; called every 2 ms."""
+        if not self.frozen:
+            for session in self.sessions:
+                session.publish()
+
+    def reading(self, name: str) -> Reading:
+        """A function that reads an output, looked up once and called at every package."""
+        controller, door, motion = self.controller, self.controller.door, self.controller.motion
+        if name in controller.registers:
+            return lambda: (controller.registers[name],)
+        known: dict[str, Reading] = {
+            "timestamp": lambda: (controller.time,),
+            "target_q": lambda: tuple(motion.position),
+            "target_qd": lambda: tuple(motion.velocity),
+            "target_moment": lambda: tuple(door.joint_torques),
+            "actual_q": lambda: tuple(door.joints),
+            "actual_qd": lambda: tuple(door.joint_speeds),
+            "actual_TCP_pose": lambda: tuple(door.tool_pose(controller.tool_offset)),
+            "robot_mode": lambda: (controller.robot_mode,),
+            "joint_mode": lambda: (JOINT_MODES[controller.robot_mode],) * 6,
+            "safety_mode": lambda: (controller.safety_mode,),
+            "safety_status": lambda: (controller.safety_mode,),
+            "speed_scaling": lambda: (float(controller.may_move),),
+            "target_speed_fraction": lambda: (1.0,),
+            "runtime_state": lambda: (controller.program_state,),
+            "robot_status_bits": self._status_bits,
+            "safety_status_bits": lambda: (SAFETY_BITS[controller.safety_mode],),
+        }
+        zeros = (0,) * _count(OUTPUTS[name])
+        return known.get(name, lambda: zeros)
+
+    def _status_bits(self) -> tuple[int]:
+        powered = self.controller.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING)
+        return (powered | (self.controller.program_state == ProgramState.PLAYING) << 1,)
 
 
 class RTDESession:
-    """One client of RTDE.
+    """One client of RTDE."""
 
-    Args:
-        connection (`Connection`):
-            Its connection.
-        controller (`Controller`):
-            The controller.
-        server (`RTDEServer`):
-            Where the session belongs; also knows the faults of the link.
-    """
-
-    def __init__(self, connection: Connection, controller: Controller, server: "RTDEServer"):
-        self._connection = connection
-        self._controller = controller
-        self._server = server
-        self._bytes = b""
+    def __init__(self, server: RTDEServer, writer: asyncio.StreamWriter):
+        self._server, self._writer = server, writer
         self._inputs: dict[int, tuple[list[str], struct.Struct]] = {}
         self._readings: list[Reading] = []
         self._format = struct.Struct(">B")
@@ -60,143 +154,81 @@ class RTDESession:
         self._ticks = 0
         self._late: deque[tuple[float, bytes]] = deque()
 
-    def received(self, data: bytes) -> None:
-        """Answers the packages of the client."""
-        self._bytes += data
-        while len(self._bytes) >= HEADER.size:
-            size, kind = HEADER.unpack_from(self._bytes)
-            if size < HEADER.size:
-                self._hang_up(f"a package of length {size}")
-                return
-            if len(self._bytes) < size:
-                return
-            body, self._bytes = self._bytes[HEADER.size : size], self._bytes[size:]
-            try:
-                self._handle(kind, body)
-            except (struct.error, UnicodeDecodeError, ValueError) as error:
-                self._hang_up(f"a malformed package of type {chr(kind)!r} ({error})")
-                return
-
-    def closed(self) -> None:
-        """Lets others write the inputs of this client."""
-        self._server.sessions.discard(self)
-        self._controller.registers.release(self)
-
     def publish(self) -> None:
         """Sends the measurements if it is time for them; called every 2 ms."""
         self._ticks += 1
-        time = self._controller.time
-        while self._late and self._late[0][0] <= time:
-            self._connection.send(self._late.popleft()[1])
+        now = self._server.controller.time
+        while self._late and self._late[0][0] <= now:
+            self._send("U", self._late.popleft()[1])
         # A controller that cannot keep up skips packages rather than to send old ones.
-        if not self._started or self._ticks % self._every or self._connection.congested:
+        if not self._started or self._ticks % self._every or self._writer.transport.get_write_buffer_size():
             return
-        values = [value for reading in self._readings for value in reading()]
-        package = HEADER.pack(HEADER.size + self._format.size, Package.DATA) + self._format.pack(1, *values)
+        body = self._format.pack(1, *(value for reading in self._readings for value in reading()))
         if self._server.delay > 0 or self._late:
-            self._late.append((time + self._server.delay, package))
+            self._late.append((now + self._server.delay, body))
         else:
-            self._connection.send(package)
+            self._send("U", body)
 
-    def _handle(self, kind: int, body: bytes) -> None:
-        if kind == Package.DATA:
-            self._take(body)
-        elif kind == Package.PROTOCOL_VERSION:
-            self._answer(kind, struct.pack(">?", struct.unpack(">H", body)[0] == 2))
-        elif kind == Package.CONTROLLER_VERSION:
-            self._answer(kind, struct.pack(">4I", *VERSION))
-        elif kind == Package.OUTPUTS:
-            self._answer(kind, self._set_up_outputs(body))
-        elif kind == Package.INPUTS:
-            self._answer(kind, self._set_up_inputs(body))
-        elif kind == Package.START:
-            self._started = bool(self._readings)
-            self._answer(kind, struct.pack(">?", self._started))
-        elif kind == Package.PAUSE:
-            self._started = False
-            self._answer(kind, struct.pack(">?", True))
-        else:
-            logger.warning("RTDE package of unknown type %d ignored", kind)
+    def handle(self, kind: str, body: bytes) -> None:
+        """Takes in a package and answers it; raises a ValueError or `struct.error` if it is malformed."""
+        match kind:
+            case "U":  # inputs
+                if not body or body[0] not in self._inputs:
+                    raise ValueError(f"unknown input recipe {body[:1].hex() or 'none'}")
+                names, layout = self._inputs[body[0]]
+                for name, value in zip(names, layout.unpack(body[1:]), strict=True):
+                    self._server.controller.write_input(name, value)
+                self._server.arrivals.append(time.monotonic())
+            case "V":  # version of the protocol
+                self._send(kind, struct.pack(">?", struct.unpack(">H", body)[0] == 2))
+            case "v":  # version of the controller
+                self._send(kind, struct.pack(">4I", *VERSION))
+            case "O":
+                self._send(kind, self._agree_on_outputs(body))
+            case "I":
+                self._send(kind, self._agree_on_inputs(body))
+            case "S":  # start
+                self._started = bool(self._readings)
+                self._send(kind, struct.pack(">?", self._started))
+            case "P":  # pause
+                self._started = False
+                self._send(kind, struct.pack(">?", True))
+            case _:
+                logger.warning("RTDE package of unknown type %r ignored", kind)
 
-    def _set_up_outputs(self, body: bytes) -> bytes:
-        frequency = struct.unpack_from(">d", body)[0]
-        names = _names(body[8:])
-        types = [output_type(name) for name in names]
+    def _agree_on_outputs(self, body: bytes) -> bytes:
+        (frequency,), names = struct.unpack_from(">d", body), _names(body[8:])
+        types = [OUTPUTS.get(name, "NOT_FOUND") for name in names]
+        answer = ",".join(types).encode()
         if "NOT_FOUND" in types or not names or not 1 <= frequency <= 1 / TIME_STEP:
             self._readings = []
-            return b"\x00" + ",".join(types).encode()
+            return b"\x00" + answer
         self._every = max(1, round(1 / (TIME_STEP * frequency)))
-        self._readings = readings(self._controller, names)
-        self._format = struct.Struct(">B" + "".join(TYPES[one] for one in types))
-        return b"\x01" + ",".join(types).encode()
+        self._readings = [self._server.reading(name) for name in names]
+        self._format = struct.Struct(">B" + "".join(FORMATS[one] for one in types))
+        return b"\x01" + answer
 
-    def _set_up_inputs(self, body: bytes) -> bytes:
-        names = _names(body)
-        owners = self._controller.registers.owners
-        types = ["IN_USE" if owners.get(name, self) is not self else input_type(name) for name in names]
-        if any(one not in TYPES for one in types):
-            return b"\x00" + ",".join(types).encode()
+    def _agree_on_inputs(self, body: bytes) -> bytes:
+        names, owners = _names(body), self._server.owners
+        types = ["IN_USE" if owners.get(name, self) is not self else INPUTS.get(name, "NOT_FOUND") for name in names]
+        answer = ",".join(types).encode()
+        if not set(types) <= set(FORMATS):
+            return b"\x00" + answer
         owners.update(dict.fromkeys(names, self))
         identity = len(self._inputs) + 1
         # One name for each number: no vector is a register, so what its numbers are called does not matter.
-        fields = [name for name, one in zip(names, types, strict=True) for _ in range(int(TYPES[one][:-1] or 1))]
-        self._inputs[identity] = (fields, struct.Struct(">" + "".join(TYPES[one] for one in types)))
-        return bytes([identity]) + ",".join(types).encode()
+        fields = [name for name, one in zip(names, types, strict=True) for _ in range(_count(one))]
+        self._inputs[identity] = (fields, struct.Struct(">" + "".join(FORMATS[one] for one in types)))
+        return bytes([identity]) + answer
 
-    def _take(self, body: bytes) -> None:
-        if not body or body[0] not in self._inputs:
-            raise ValueError(f"unknown input recipe {body[:1].hex() or 'none'}")
-        fields, layout = self._inputs[body[0]]
-        values = zip(fields, layout.unpack(body[1:]), strict=True)
-        self._controller.registers.write_inputs(values, self._controller.time)
-
-    def _answer(self, kind: int, body: bytes) -> None:
-        self._connection.send(HEADER.pack(HEADER.size + len(body), kind) + body)
-
-    def _hang_up(self, reason: str) -> None:
-        logger.warning("RTDE client sent %s: hung up", reason)
-        self._connection.close()
-
-
-class RTDEServer:
-    """All clients of RTDE.
-
-    Args:
-        controller (`Controller`):
-            The controller.
-
-    Attributes:
-        sessions (`set[RTDESession]`): The clients.
-        delay (`float`): Seconds by which measurements reach the clients late.
-        frozen (`bool`): Whether measurements are sent at all.
-    """
-
-    def __init__(self, controller: Controller):
-        self._controller = controller
-        self.sessions: set[RTDESession] = set()
-        self.delay = 0.0
-        self.frozen = False
-
-    def accept(self, connection: Connection) -> RTDESession:
-        """Takes in a client.
-
-        Args:
-            connection (`Connection`):
-                Its connection.
-
-        Returns:
-            `RTDESession`: its session.
-        """
-        session = RTDESession(connection, self._controller, self)
-        self.sessions.add(session)
-        return session
-
-    def publish(self) -> None:
-        """Sends measurements to all clients whose turn it is; called every 2 ms."""
-        if not self.frozen:
-            for session in list(self.sessions):
-                session.publish()
+    def _send(self, kind: str, body: bytes) -> None:
+        if not self._writer.is_closing():
+            self._writer.write(HEADER.pack(HEADER.size + len(body), ord(kind)) + body)
 
 
 def _names(body: bytes) -> list[str]:
     return [name for name in body.decode().split(",") if name]
+
+
+def _count(kind: str) -> int:
+    return int(FORMATS[kind][:-1] or 1)

@@ -13,7 +13,6 @@ from ..foresight import uncertainty
 from ..modeling_ufrnn import UFRNNPolicy
 from .trial import Imagination, TrialHistory
 
-STRIP_COLUMNS = 5
 MOST_SHOWN = 5
 
 
@@ -22,17 +21,6 @@ def draw(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
 
     Top: the camera, its reconstruction, and imagined images at the horizon. Below: the imagined paths of the joint that
     the candidates disagree most about, and the predicted variance over the whole trial.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            The policy that ran the trial.
-        history (`TrialHistory`):
-            The trial.
-        path (`Path`):
-            Where to write the PNG.
-
-    Raises:
-        ValueError: If nothing was imagined in the trial.
     """
     imagined = decisive(history, policy.model.network.joint_dim)
     camera, joint_dim = policy.config.cameras[0], policy.model.network.joint_dim
@@ -66,64 +54,11 @@ def draw(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
         figure.savefig(path, dpi=110)
 
 
-def draw_strip(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
-    """Draws imagined futures of a decisive step beside what happened, and writes them to `path`.
-
-    One row a candidate, the kept one marked, and the camera in the last row; one column a step.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            The policy that ran the trial.
-        history (`TrialHistory`):
-            The trial.
-        path (`Path`):
-            Where to write the PNG.
-
-    Raises:
-        ValueError: If nothing was imagined in the trial.
-    """
-    joint_dim, camera = policy.model.network.joint_dim, policy.config.cameras[0]
-    imagined = decisive(history, joint_dim)
-    rows = _representatives(imagined, joint_dim)
-    features = imagined.futures.mean[:, rows, joint_dim:]  # (T, n, D_f)
-    columns = range(0, len(features), max(2, -(-len(features) // STRIP_COLUMNS)))
-    with matplotlib.rc_context({"font.size": 9}):
-        figure = Figure(figsize=(1.1 + 1.25 * len(columns), 0.7 + 1.3 * (len(rows) + 1)), layout="constrained")
-        panels = figure.subplots(len(rows) + 1, len(columns), squeeze=False)
-        for column, index in enumerate(columns):
-            ahead = imagined.ahead + index
-            now = imagined.step + ahead
-            pictures = [*_decode(policy, features[index], camera), *history.images[now : now + 1]]
-            for panel, picture in zip(panels[:, column], pictures, strict=False):
-                panel.imshow(picture)
-            panels[0, column].set_title(f"t + {ahead}", fontsize=9)
-            for number, panel in zip([*rows, None], panels[:, column], strict=True):
-                _frame(panel, number == imagined.chosen)
-            if len(pictures) == len(rows):
-                panels[-1, column].text(0.5, 0.5, "trial over", ha="center", va="center", fontsize=8)
-        for number, panel in zip(rows, panels[:-1, 0], strict=True):
-            label = f"future {number + 1}" + ("\n(kept)" if number == imagined.chosen else "")
-            panel.set_ylabel(label, color="C3" if number == imagined.chosen else "black")
-        panels[-1, 0].set_ylabel("what\nhappened")
-        figure.suptitle(f"Imagined at step t = {imagined.step} of a trial with a {history.door_kind} door", fontsize=10)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
-
-
 def decisive(history: TrialHistory, joint_dim: int) -> Imagination:
     """The step at which what was imagined mattered most.
 
     With recall the last time that the trial went back, which a door that was opened was opened by. With foresight at
     every step the one whose futures part most in the 2 s before the first try (before the end, without one).
-
-    Args:
-        history (`TrialHistory`):
-            The trial.
-        joint_dim (`int`):
-            Number of joints.
-
-    Returns:
-        `Imagination`: the futures of that step.
 
     Raises:
         ValueError: If nothing was imagined in the trial.
@@ -155,8 +90,8 @@ def _title(policy: UFRNNPolicy, imagined: Imagination, number: int) -> str:
     kept = " (kept)" if number == imagined.chosen else ""
     if imagined.refuted is not None:
         return f"future {number + 1}{kept}\nlike a failed try: {min(imagined.refuted[number], 1):.0%}"
-    network, foresight = policy.model.network, policy.model.foresight
-    final = uncertainty(imagined.futures.log_variance[-1, number], network.joint_dim, foresight.aggregation)
+    aggregation = policy.config.foresight.variance_aggregation
+    final = uncertainty(imagined.futures.log_variance[-1, number], policy.model.network.joint_dim, aggregation)
     return f"future {number + 1}{kept}\nuncertainty {final:.3g}"
 
 

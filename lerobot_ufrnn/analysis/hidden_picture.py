@@ -1,13 +1,13 @@
 """A picture of hidden states on their plane: demonstrations dotted, a trial solid (UF-RNN, Figs. 5 and 7)."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from ..networks import HiddenState
 from .colors import DOOR_COLORS
 from .hidden_states import Plane
-from .trial import Attempt, TrialHistory
+from .trial import TrialHistory
 
 OTHER_COLOR = "#999999"
 HELD_COLOR = "#ffcc33"
@@ -35,10 +35,7 @@ class HiddenPaths:
         demonstrations (`list[np.ndarray]`): path of each, (L, 2).
         trial (`np.ndarray`): path of the trial, (L, 2).
         shares (`tuple[float, float]`): share of the demonstrations' variance along each axis.
-        door_kind (`str`): kind of the trial's door.
-        attempts (`list[Attempt]`): directions tried in the trial.
-        held (`list[int]`): steps of the trial at which somebody held the door.
-        success (`bool`): whether the trial's door was opened.
+        history (`TrialHistory`): the trial.
     """
 
     label: str
@@ -46,28 +43,11 @@ class HiddenPaths:
     demonstrations: list[np.ndarray]
     trial: np.ndarray
     shares: tuple[float, float]
-    door_kind: str
-    attempts: list[Attempt]
-    held: list[int]
-    success: bool
+    history: TrialHistory
 
     @classmethod
     def of(cls, label: str, kinds: list[str], states: Sequence[HiddenState], history: TrialHistory) -> "HiddenPaths":
-        """Fits the plane to demonstrations and puts them and a trial on it.
-
-        Args:
-            label (`str`):
-                Name of the model.
-            kinds (`list[str]`):
-                Kind of each demonstration.
-            states (`Sequence[HiddenState]`):
-                States along each, (L, hidden size) each.
-            history (`TrialHistory`):
-                The trial.
-
-        Returns:
-            `HiddenPaths`: the paths.
-        """
+        """Fits the plane to the states along demonstrations and puts them and a trial on it."""
         plane = Plane.fit(torch.cat([of_episode.h_shared for of_episode in states]))
         first, second = plane.shares.tolist()
         return cls(
@@ -76,24 +56,15 @@ class HiddenPaths:
             [plane.project(of_episode.h_shared).cpu().numpy() for of_episode in states],
             plane.project(HiddenState.stack(history.states).h_shared[:, 0]).cpu().numpy(),
             (first, second),
-            history.door_kind,
-            history.attempts,
-            history.held,
-            history.success,
+            history,
         )
 
 
 def draw(models: Sequence[HiddenPaths], path: Path) -> None:
-    """Draws a panel a model and writes them to `path`.
+    """Draws a panel a model and writes them to `path`, whose ending chooses the format.
 
     Each demonstration is a pale line, the mean of each kind a dotted one. The trial is the black line; what it tries
     shows in the colour of that kind, and the time for which somebody held the door is highlighted.
-
-    Args:
-        models (`Sequence[HiddenPaths]`):
-            The models.
-        path (`Path`):
-            Where to write the picture; its ending chooses the format.
     """
     num_columns = min(len(models), PANELS_PER_ROW)
     num_rows = -(-len(models) // num_columns)
@@ -104,9 +75,11 @@ def draw(models: Sequence[HiddenPaths], path: Path) -> None:
             _draw_model(panel, model)
         for panel in panels[len(models) :]:
             panel.set_visible(False)
-        kinds = dict.fromkeys(kind for model in models for kind in (*model.kinds, *_directions(model)))
+        kinds = dict.fromkeys(
+            kind for model in models for kind in (*model.kinds, *(way for _, way in model.history.attempts))
+        )
         figure.legend(
-            handles=_legend(list(kinds), with_held=any(model.held for model in models)),
+            handles=_legend(list(kinds), with_held=any(model.history.held for model in models)),
             loc="outside lower center",
             ncols=min(4, 2 * num_columns),
             frameon=False,
@@ -116,7 +89,7 @@ def draw(models: Sequence[HiddenPaths], path: Path) -> None:
 
 
 def _draw_model(panel: Axes, model: HiddenPaths) -> None:
-    kinds = list(dict.fromkeys(model.kinds))
+    kinds, history = list(dict.fromkeys(model.kinds)), model.history
     for number, kind in enumerate(kinds):
         color = DOOR_COLORS.get(kind, OTHER_COLOR)
         paths = [path for path, of_kind in zip(model.demonstrations, model.kinds, strict=True) if of_kind == kind]
@@ -127,11 +100,11 @@ def _draw_model(panel: Axes, model: HiddenPaths) -> None:
         # Dots of one kind fall between those of the others where their paths agree.
         dots = (DOT_SPACING * number / len(kinds), (1, DOT_SPACING - 1))
         panel.plot(*mean.T, color=color, linestyle=dots, linewidth=2)
-    if model.held:
-        panel.plot(*model.trial[model.held].T, color=HELD_COLOR, linewidth=6, alpha=0.6, solid_capstyle="round")
+    if history.held:
+        panel.plot(*model.trial[history.held].T, color=HELD_COLOR, linewidth=6, alpha=0.6, solid_capstyle="round")
     panel.plot(*model.trial.T, color="black", linewidth=0.8)
     panel.plot(*model.trial[0], "k.", markersize=8)
-    for number, (step, direction) in enumerate(model.attempts):
+    for number, (step, direction) in enumerate(history.attempts):
         panel.plot(
             *model.trial[step],
             marker="o" if number == 0 else "s",
@@ -139,33 +112,26 @@ def _draw_model(panel: Axes, model: HiddenPaths) -> None:
             markerfacecolor=DOOR_COLORS.get(direction, OTHER_COLOR),
             markeredgecolor="black",
         )
-    if model.success:
+    if history.success:
         panel.plot(*model.trial[-1], marker="*", markersize=13, markerfacecolor="white", markeredgecolor="black")
-    result = f"opened at step {len(model.trial) - 1}" if model.success else "not opened"
+    result = f"opened at step {len(model.trial) - 1}" if history.success else "not opened"
     first_try = "no try"
-    if model.attempts:
-        first_try = f"first try {model.attempts[0].direction} at step {model.attempts[0].step}"
-    panel.set_title(f"{model.label}\n{model.door_kind} door: {first_try},\n{result}", fontsize=9)
+    if history.attempts:
+        first_try = f"first try {history.attempts[0].direction} at step {history.attempts[0].step}"
+    panel.set_title(f"{model.label}\n{history.door_kind} door: {first_try},\n{result}", fontsize=9)
     first, second = model.shares
     panel.set(xlabel=f"PC 1 ({first:.0%})", ylabel=f"PC 2 ({second:.0%})")
 
 
-def _directions(model: HiddenPaths) -> list[str]:
-    return [direction for _, direction in model.attempts]
-
-
 def _legend(kinds: list[str], with_held: bool) -> list[Line2D]:
     def marker(shape: str, size: float, face: str, label: str) -> Line2D:
-        return Line2D(
-            [],
-            [],
-            marker=shape,
-            markersize=size,
-            markerfacecolor=face,
-            markeredgecolor="black",
-            linestyle="none",
-            label=label,
-        )
+        style: dict[str, Any] = {
+            "markersize": size,
+            "markerfacecolor": face,
+            "markeredgecolor": "black",
+            "linestyle": "none",
+        }
+        return Line2D([], [], marker=shape, label=label, **style)
 
     handles = [
         Line2D([], [], color=DOOR_COLORS.get(kind, OTHER_COLOR), linestyle=":", linewidth=2, label=f"{kind} (offline)")
@@ -175,25 +141,21 @@ def _legend(kinds: list[str], with_held: bool) -> list[Line2D]:
     if with_held:
         handles.append(Line2D([], [], color=HELD_COLOR, linewidth=6, alpha=0.6, label="door held"))
     handles.append(marker(".", 8, "black", "start of the trial"))
-    return [
-        *handles,
-        marker("o", 9, "white", "first try"),
-        marker("s", 5, "white", "further try"),
-        marker("*", 13, "white", "opened"),
-    ]
+    tries = [marker("o", 9, "white", "first try"), marker("s", 5, "white", "further try")]
+    return [*handles, *tries, marker("*", 13, "white", "opened")]
 
 
-def to_csv(models: Sequence[HiddenPaths]) -> str:
+def to_table(models: Sequence[HiddenPaths]) -> pd.DataFrame:
     """The numbers: one row a step of a demonstration or of the trial, which says what was tried at it and if held."""
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("model", "path", "kind", "step", "pc1", "pc2", "tried", "held"))
+    parts = []
     for model in models:
-        paths = [(str(number), kind) for number, kind in enumerate(model.kinds)] + [("trial", model.door_kind)]
-        for (name, kind), points in zip(paths, (*model.demonstrations, model.trial), strict=True):
-            tried, held = (dict(model.attempts), model.held) if name == "trial" else ({}, [])
-            writer.writerows(
-                (model.label, name, kind, step, f"{first:.5f}", f"{second:.5f}", tried.get(step, ""), int(step in held))
-                for step, (first, second) in enumerate(points)
-            )
-    return text.getvalue()
+        names = [str(number) for number in range(len(model.kinds))] + ["trial"]
+        kinds = [*model.kinds, model.history.door_kind]
+        for name, kind, points in zip(names, kinds, [*model.demonstrations, model.trial], strict=True):
+            part = pd.DataFrame({"model": model.label, "path": name, "kind": kind, "step": range(len(points))})
+            part[["pc1", "pc2"]] = points
+            tried = dict(model.history.attempts) if name == "trial" else {}
+            part["tried"] = part["step"].map(tried).fillna("")
+            part["held"] = part["step"].isin(model.history.held if name == "trial" else []).astype(int)
+            parts.append(part)
+    return pd.concat(parts)

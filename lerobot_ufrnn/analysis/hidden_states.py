@@ -85,15 +85,7 @@ class Plane:
 
     @classmethod
     def fit(cls, points: Tensor) -> "Plane":
-        """The plane of some points.
-
-        Args:
-            points (`Tensor`):
-                At least two points in at least two dimensions, (M, S).
-
-        Returns:
-            `Plane`: their plane.
-        """
+        """The plane of two or more points, (M, S)."""
         origin = points.mean(0)
         _, lengths, directions = torch.linalg.svd(points - origin, full_matrices=False)
         axes = directions[:2]

@@ -52,9 +52,11 @@ class TrialHistory:
         states (`list[HiddenState]`): hidden state after each step, (1, hidden size) each.
         imaginations (`list[Imagination]`): what was imagined: with recall when surprised, with foresight alone at each
             step, otherwise never.
+        returns (`list[int]`): steps at which recall was surprised, or found a try blocked, and went back.
         attempts (`list[Attempt]`): directions tried, also while the door was held, in order.
         held (`list[int]`): steps at which somebody held the door.
         success (`bool`): whether the door was opened, which ends the trial.
+        film (`list[np.ndarray]`): the scene before the first step and after each, if it was to be filmed.
     """
 
     door_kind: str
@@ -64,9 +66,11 @@ class TrialHistory:
     variances: list[np.ndarray] = field(default_factory=list)
     states: list[HiddenState] = field(default_factory=list)
     imaginations: list[Imagination] = field(default_factory=list)
+    returns: list[int] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
     held: list[int] = field(default_factory=list)
     success: bool = False
+    film: list[np.ndarray] = field(default_factory=list)
 
     @property
     def first_try(self) -> int | None:
@@ -79,20 +83,8 @@ class TrialHistory:
         return self.success and bool(self.attempts) and self.attempts[0].direction != self.door_kind
 
 
-def run_trial(policy: UFRNNPolicy, env: gym.Env, seed: int) -> TrialHistory:
-    """Runs one trial and keeps what the policy saw, remembered and foresaw.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            Trained policy.
-        env (`gym.Env`):
-            Door environment with a time limit.
-        seed (`int`):
-            Seed of environment and exploration noise.
-
-    Returns:
-        `TrialHistory`: the trial.
-    """
+def run_trial(policy: UFRNNPolicy, env: gym.Env, seed: int, film: bool = False) -> TrialHistory:
+    """Runs one trial in a door environment with a time limit; `seed` is that of environment and exploration noise."""
     set_seed(seed)
     preprocess, postprocess = make_pre_post_processors(policy.config)
     policy.reset()
@@ -103,8 +95,11 @@ def run_trial(policy: UFRNNPolicy, env: gym.Env, seed: int) -> TrialHistory:
     camera = policy.config.cameras[0].rsplit(".", 1)[-1]
     done = False
     while not done:
+        step, before = len(history.states), info
+        if film:
+            history.film.append(np.asarray(env.render()))
         if info["held"]:
-            history.held.append(len(history.states))
+            history.held.append(step)
         history.images.append(observation["pixels"][camera])
         history.joints.append(np.asarray(observation["agent_pos"]))
         with torch.inference_mode():
@@ -112,28 +107,27 @@ def run_trial(policy: UFRNNPolicy, env: gym.Env, seed: int) -> TrialHistory:
         assert policy.memory is not None  # `select_action` sets it
         history.variances.append(policy.model.modality_variance(policy.memory.prediction)[0].cpu().numpy())
         history.states.append(policy.memory.state)
-        if (imagined := _imagination(policy, len(history.states) - 1)) is not None:
-            history.imaginations.append(imagined)
-        before = info
+        _look_into(policy, step, history)
         observation, _, terminated, truncated, info = env.step(postprocess(action).numpy()[0])
         done = terminated or truncated
-        step = len(history.states) - 1
         for tried in ("attempts", "tried_while_held"):
             history.attempts += [Attempt(step, direction) for direction in info[tried][len(before[tried]) :]]
+    if film:
+        history.film.append(np.asarray(env.render()))
     history.success = bool(info["is_success"])
     return history
 
 
-def _imagination(policy: UFRNNPolicy, step: int) -> Imagination | None:
-    """What the policy imagined at the step that it has just taken."""
+def _look_into(policy: UFRNNPolicy, step: int, history: TrialHistory) -> None:
+    """Notes what the policy imagined at the step that it has just taken, and whether it went back."""
     # The state after a step predicts the next one, and the first imagined state the one after that.
     if (trace := policy.last_trace) is not None:
         futures = Prediction(*(values[:, :, 0] for values in trace.imagined))
-        return Imagination(step, 2, futures, int(trace.chosen[0]))
-    if policy.recall is None or policy.recall.exploration != "foresight":
-        return None
-    event = next(iter(policy.recall.events[0][-1:]), None)
-    if event is None or event.step != step or event.futures is None:
-        return None
-    # A step later at the earliest the arm is back and the plan begins.
-    return Imagination(step, 3, event.futures, event.chosen, event.refuted.cpu().numpy())
+        history.imaginations.append(Imagination(step, 2, futures, int(trace.chosen[0])))
+    elif policy.recall is not None and policy.recall.events[0] and policy.recall.events[0][-1].step == step:
+        event = policy.recall.events[0][-1]
+        history.returns.append(step)
+        if policy.recall.exploration == "foresight" and event.futures is not None:
+            # A step later at the earliest the arm is back and the plan begins.
+            refuted = event.refuted.cpu().numpy()
+            history.imaginations.append(Imagination(step, 3, event.futures, event.chosen, refuted))

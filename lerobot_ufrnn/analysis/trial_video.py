@@ -1,68 +1,64 @@
-"""A video of one trial, with the time and what was tried so far written above each frame."""
+"""A moving picture of one trial, with what was tried and when the policy went back written below it."""
 
-from collections.abc import Iterable, Sequence
-from io import BytesIO
+from collections.abc import Sequence
+from pathlib import Path
 
-import av
-import cv2
 import numpy as np
-from matplotlib.colors import to_rgb
-from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from .colors import DOOR_COLORS
 from .trial import TrialHistory
 
 FRAMES_PER_SECOND = 10
-BAR_HEIGHT = 48
-WHITE = "#eeeeee"
+SECONDS_AT_END = 3.0
+BAR_HEIGHT, FONT_SIZE = 58, 16
+WHITE, ALARM = "#ffffff", "#ff7777"
 
 
-def annotate(frames: Iterable[NDArray[np.uint8]], history: TrialHistory) -> list[NDArray[np.uint8]]:
-    """Adds a bar with step, time and attempts so far above each frame, where no player puts its controls.
+def captions(history: TrialHistory) -> list[str]:
+    """What to write below each picture of a filmed trial."""
+    tries, texts, text = dict(history.attempts), [], "push, pull or slide?"
+    for step in range(-1, len(history.states)):
+        # The picture after a step is the first one that shows what became of it.
+        if step in tries:
+            text = f"tries to {tries[step]}"
+        if step in history.returns:
+            text = "surprised: goes back"
+        texts.append(text)
+    return [*texts[:-1], "opened"] if history.success else texts
 
-    Args:
-        frames (`Iterable[NDArray[np.uint8]]`):
-            Pictures of the trial, from before its first step to after its last, (height, width, 3).
-        history (`TrialHistory`):
-            The trial.
 
-    Returns:
-        `list[NDArray[np.uint8]]`: the frames, `BAR_HEIGHT` higher.
+def annotate(history: TrialHistory) -> list[Image.Image]:
+    """The pictures of a filmed trial, each with a bar below: its caption, the time, and all that was tried so far."""
+    font = ImageFont.load_default(FONT_SIZE)
+    pictures = []
+    for number, (frame, caption) in enumerate(zip(history.film, captions(history), strict=True)):
+        height, width, _ = frame.shape
+        picture = Image.new("RGB", (width, height + BAR_HEIGHT))
+        picture.paste(Image.fromarray(frame))
+        draw, upper, lower = ImageDraw.Draw(picture), height + BAR_HEIGHT // 4, height + 3 * BAR_HEIGHT // 4
+        draw.text((8, upper), caption, ALARM if "surprised" in caption else WHITE, font, anchor="lm")
+        draw.text((width - 8, upper), f"{number / FRAMES_PER_SECOND:.1f} s", WHITE, font, anchor="rm")
+        left = 8.0
+        for way in [direction for step, direction in history.attempts if step < number]:
+            right = left + draw.textlength(way, font) + 12
+            draw.rectangle((left, lower - 11, right, lower + 11), fill=DOOR_COLORS[way])
+            draw.text((left + 6, lower), way, WHITE, font, anchor="lm")
+            left = right + 8
+        pictures.append(picture)
+    return pictures
+
+
+def write_gif(pictures: Sequence[Image.Image], path: Path, every: int = 1, num_colors: int = 128) -> None:
+    """Writes an animation that rests at its end, then begins again.
+
+    `every` keeps only each so-many-th picture, and the last: so many times as fast. All pictures share `num_colors`, so
+    that what stands still takes no space.
     """
-    annotated = []
-    for number, frame in enumerate(frames):
-        picture = np.pad(frame, ((BAR_HEIGHT, 0), (0, 0), (0, 0)))
-        lines = [[(f"step {number}", WHITE), (f"{number / FRAMES_PER_SECOND:.1f} s", WHITE)], [("tried:", WHITE)]]
-        if history.success and number == len(history.states):
-            lines[0].append(("opened", DOOR_COLORS[history.door_kind]))
-        lines[1] += [(way, DOOR_COLORS[way]) for step, way in history.attempts if step < number]
-        for line, words in enumerate(lines):
-            left = 6
-            for word, color in words:
-                corner = (left, 18 + 21 * line)
-                rgb = [255 * value for value in to_rgb(color)]
-                cv2.putText(picture, word, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.5, rgb, 1, cv2.LINE_AA)
-                left += cv2.getTextSize(word, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] + 10
-        annotated.append(picture)
-    return annotated
-
-
-def encode(frames: Sequence[NDArray[np.uint8]]) -> bytes:
-    """An MP4 file (H.264) that browsers play.
-
-    Args:
-        frames (`Sequence[NDArray[np.uint8]]`):
-            Its frames, (height, width, 3), of even height and width.
-
-    Returns:
-        `bytes`: the file.
-    """
-    file = BytesIO()
-    height, width, _ = frames[0].shape
-    with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=FRAMES_PER_SECOND, options={"crf": "26"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
-    return file.getvalue()
+    kept = [*pictures[:-1:every], pictures[-1]]
+    sample = np.concatenate([np.asarray(picture) for picture in kept[:: -(-len(kept) // 12)]])
+    palette = Image.fromarray(sample).quantize(num_colors)
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in kept]
+    milliseconds = [1000 // FRAMES_PER_SECOND] * (len(kept) - 1) + [round(1000 * SECONDS_AT_END)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=milliseconds, loop=0)

@@ -1,40 +1,39 @@
 """`ufrnn`: one console command, one module a subcommand. The only place where policy and door environment meet."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
+from typing import get_type_hints
 
 from draccus.utils import ParsingError
+
+# Nothing here imports LeRobot, PyTorch or MuJoCo: `ufrnn --help` answers at once, and a command that only starts others
+# leaves their memory to them.
+from .flags import parse_flags
 
 COMMANDS = {
     "demo": "record, train, evaluate and draw: the whole path with one command",
     "record": "record demonstrations of the scripted expert into a LeRobotDataset",
     "results": "turn the trial log of lerobot-eval into a table per door",
     "foresight": "draw what foresight imagines where the policy has to choose",
-    "protocol": "train and evaluate models x seeds x checkpoints, resumably; table of all results",
-    "curve": "draw the success rate over the epochs of training from that table",
+    "video": "film a door that is found out: a wrong try, a surprise, another try",
     "hidden": "draw hidden states along the demonstrations and in a trial, model by model",
-    "drift": "measure how far imagined futures drift from the demonstrations",
     "lyapunov": "draw how chaotic the imagined futures are along the demonstrations",
-    "rehearse": "run trials on the digital twin of the robot, through stock lerobot-rollout",
-    "operate": "record demonstrations on the digital twin of the robot, through stock lerobot-record",
-    "faults": "make things fail while stock lerobot-record moves the twin; table of what became of it",
-    "report": "put all results, tables, pictures and videos into one page",
-    "benchmark": "time it against the readable code, XLA, ACT and Diffusion Policy",
+    "report": "put the tables, pictures and videos of a folder into one page",
 }
 
 USAGE = "usage: ufrnn COMMAND [--flag=value ...]\n\n" + "".join(
     f"  {name:<10} {summary}\n" for name, summary in COMMANDS.items()
 )
 USAGE += (
-    "\n`ufrnn COMMAND --help` lists the flags of a command. Training and evaluation are LeRobot's own commands:\n"
+    "\n`ufrnn COMMAND --help` explains the flags of a command. Training and evaluation are LeRobot's own commands:\n"
     "  lerobot-train --policy.type=ufrnn --dataset.repo_id=...\n"
     "  lerobot-eval --policy.path=... --env.type=door --env.task=all\n"
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one subcommand.
+    """Runs one subcommand: the function `run` of its module, with the configuration that `run` takes.
 
     Args:
         arguments (`Sequence[str]`, *optional*):
@@ -50,9 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"ufrnn: unknown command '{name}'\n\n{USAGE}", end="", file=sys.stderr)
         return 2
-    run: Callable[[list[str]], None] = import_module(f"{__name__}.{name}").run
     try:
-        run(rest)
+        run = import_module(f"{__name__}.{name}").run
+        run(parse_flags(get_type_hints(run)["config"], rest, f"ufrnn {name}"))
     except KeyboardInterrupt:
         print(f"\nufrnn {name}: interrupted", file=sys.stderr)
         return 130

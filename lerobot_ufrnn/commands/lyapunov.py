@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from lerobot.utils.random_utils import set_seed
 
+from env_door.checks import check_range
 from env_door.demonstration import TIMING_STREAM
 from env_door.env import DoorEnv
 from env_door.expert import DoorExpert
@@ -13,8 +14,7 @@ from env_door.provenance import Provenance
 
 from ..analysis.hidden_states import read_demonstrations, states_along
 from ..analysis.lyapunov import exponents_over_time
-from ..analysis.lyapunov_picture import ExponentCurves, draw, to_csv
-from .flags import parse_flags
+from ..analysis.lyapunov_picture import draw, to_table
 from .policies import load_policies, read_provenance
 
 PHASES = ("grasp", "twist", "open")
@@ -23,60 +23,41 @@ PHASES = ("grasp", "twist", "open")
 
 @dataclass
 class LyapunovConfig:
-    """Which policies to compare.
-
-    Args:
-        policy_paths (`list[str]`):
-            Checkpoint folders or Hub repositories of `ufrnn` policies.
-        dataset_dir (`Path`):
-            Folder of the demonstrations.
-        output (`Path`, *optional*, defaults to `lyapunov.png`):
-            Picture to write; the numbers go beside it, with the ending `.csv`.
-        labels (`list[str]`, *optional*):
-            Names of the policies; those of the paper by default.
-        horizon (`int`, *optional*, defaults to `10`):
-            Number T of imagined steps over which perturbations grow.
-        seed (`int`, *optional*, defaults to `2000`):
-            Seed of exploration noise.
-    """
+    """Draws how fast imagined futures part that begin with nearly the same hidden state, along demonstrations."""
 
     policy_paths: list[str]
+    """Checkpoint folders or Hub repositories of `ufrnn` policies."""
     dataset_dir: Path
+    """Folder of the demonstrations."""
     output: Path = Path("lyapunov.png")
+    """Picture to write; the numbers go beside it, with the ending `.csv`."""
     labels: list[str] = field(default_factory=list)
+    """Names of the policies; those of the paper by default."""
     horizon: int = 10
+    """Number T of imagined steps over which perturbations grow."""
     seed: int = 2000
+    """Seed of exploration noise."""
 
     def __post_init__(self) -> None:
-        if self.horizon < 1:
-            raise ValueError(f"--horizon must be at least 1, got {self.horizon}.")
+        check_range(self, "horizon", low=1)
 
 
-def run(arguments: list[str]) -> None:
+def run(config: LyapunovConfig) -> None:
     """Writes the picture and the table."""
-    config = parse_flags(LyapunovConfig, arguments)
-    curves = []
+    curves = {}
     for label, policy in load_policies(config.policy_paths, config.labels).items():
         set_seed(config.seed)
         states = states_along(policy, read_demonstrations(policy, config.dataset_dir))
-        curves.append(ExponentCurves(label, exponents_over_time(policy.model.network, states, config.horizon)))
+        curves[label] = exponents_over_time(policy.model.network, states, config.horizon)
     provenance = read_provenance(config.dataset_dir)
     draw(curves, phase_starts(provenance) if provenance else {}, config.horizon, config.output)
     table = config.output.with_suffix(".csv")
-    table.write_text(to_csv(curves))
+    to_table(curves).to_csv(table, index=False, float_format="%.5f")
     print(f"Lyapunov exponents: {config.output}, {table}")
 
 
 def phase_starts(provenance: Provenance) -> dict[str, list[int]]:
-    """When the phases of the task begin in recorded demonstrations: the expert plans them once more.
-
-    Args:
-        provenance (`Provenance`):
-            How the demonstrations were recorded.
-
-    Returns:
-        `dict[str, list[int]]`: for each phase the step at which it begins, once for each seed.
-    """
+    """When the phases of the task begin in recorded demonstrations, once a seed: the expert plans them once more."""
     starts: dict[str, list[int]] = {phase: [] for phase in PHASES}
     env = DoorEnv(arm=provenance.settings["arm"], door_offset=provenance.settings["door_offset"])
     try:

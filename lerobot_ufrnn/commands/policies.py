@@ -2,6 +2,8 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import gymnasium as gym
 from lerobot.configs import PreTrainedConfig
 
 import env_door  # noqa: F401  registers the environment
+from env_door.checks import check_range
 from env_door.provenance import PROVENANCE_PATH, Provenance
 
 from ..analysis.trial import TrialHistory, run_trial
@@ -18,15 +21,40 @@ MODEL_NAMES = {"foresight": "UF-RNN", "noise": "SH-RNN+noise", "none": "SH-RNN"}
 """What the paper calls a policy with this exploration."""
 
 
+@dataclass(kw_only=True)
+class DoorTrialConfig:
+    """Which trial to run; the commands that run one add their own flags."""
+
+    kind: str = "any"
+    """Kind of the door: `push`, `pull`, `slide` or `random`; `any` takes the first that shows something."""
+    arm: str = "ur5e"
+    """`ur5e` or `panda`."""
+    door_offset: float = 0.0
+    """Half-width in metres of the range of the door's shift."""
+    seed: int = 2000
+    """Seed of environment and exploration noise."""
+    num_steps: int = 300
+    """Longest trial in steps."""
+
+    def __post_init__(self) -> None:
+        check_range(self, "num_steps", low=1)
+
+
+def run_door_trial(
+    policy: UFRNNPolicy, config: DoorTrialConfig, kind: str, film: bool = False, **options: Any
+) -> TrialHistory:
+    """Runs one trial with a door of this kind; further options are those of [`~env_door.env.DoorEnv`]."""
+    settings: dict[str, Any] = {
+        "max_episode_steps": config.num_steps,
+        "arm": config.arm,
+        "door_offset": config.door_offset,
+    }
+    with closing(gym.make("env_door/Door-v0", kind=kind, **settings, **options)) as env:
+        return run_trial(policy, env, config.seed, film)
+
+
 def load_policy(path: str) -> UFRNNPolicy:
-    """Loads a policy with the reference kernel, which keeps what it imagines and needs no compiling.
-
-    Args:
-        path (`str`):
-            Checkpoint folder or Hub repository of a `ufrnn` policy.
-
-    Returns:
-        `UFRNNPolicy`: the policy.
+    """Loads a `ufrnn` policy with the reference kernel, which keeps what it imagines and needs no compiling.
 
     Raises:
         ValueError: If the policy is of another type.
@@ -39,16 +67,16 @@ def load_policy(path: str) -> UFRNNPolicy:
 
 
 def load_policies(paths: Sequence[str], labels: Sequence[str]) -> dict[str, UFRNNPolicy]:
-    """Loads policies to compare.
+    """Loads policies to compare, by name.
 
     Args:
         paths (`Sequence[str]`):
-            See `load_policy`.
+            Checkpoint folders or Hub repositories.
         labels (`Sequence[str]`):
             Their names; when empty, what the paper calls a policy with such exploration.
 
     Returns:
-        `dict[str, UFRNNPolicy]`: the policies by name, in order.
+        `dict[str, UFRNNPolicy]`: the policies, in order.
 
     Raises:
         ValueError: If there is no policy, one is of another type, or they cannot be told apart by their names.
@@ -62,29 +90,6 @@ def load_policies(paths: Sequence[str], labels: Sequence[str]) -> dict[str, UFRN
     if len(set(names)) != len(names):
         raise ValueError(f"The policies would be called {names}; tell them apart with --labels=[...].")
     return dict(zip(names, policies, strict=True))
-
-
-def run_door_trial(policy: UFRNNPolicy, seed: int, num_steps: int, **options: Any) -> TrialHistory:
-    """Runs one trial with a door.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            Trained policy.
-        seed (`int`):
-            Seed of environment and exploration noise.
-        num_steps (`int`):
-            Longest trial in steps.
-        **options (`Any`):
-            Options of [`~env_door.env.DoorEnv`].
-
-    Returns:
-        `TrialHistory`: the trial.
-    """
-    env = gym.make("env_door/Door-v0", max_episode_steps=num_steps, **options)
-    try:
-        return run_trial(policy, env, seed)
-    finally:
-        env.close()
 
 
 def read_provenance(dataset_dir: Path) -> Provenance | None:

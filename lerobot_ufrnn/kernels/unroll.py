@@ -10,14 +10,19 @@ import torch
 from torch import Generator, Tensor
 from torch.autograd.function import once_differentiable
 
-from ..foresight import Foresight, ForesightTrace
+from ..configuration_ufrnn import UFRNNConfig
+from ..foresight import UFRNN, Foresight, ForesightTrace, Memory
 from ..networks import SHLSTM, HiddenState, Prediction
-from ..recurrent import UFRNN, Memory
 from .layout import GateGradients, Options, Sizes, Steps, TransposedWeights, Weights
 from .matmul import PANEL
 from .packing import Cells, Heads, pack_cells, pack_heads, to_panels
 from .walk import imagine, walk
 from .walk_back import walk_back
+
+
+def unsupported(config: UFRNNConfig) -> str | None:
+    """Name of a field whose value is not compiled."""
+    return None
 
 
 class _Packed(NamedTuple):
@@ -37,8 +42,9 @@ class FastUFRNN(UFRNN):
     Imagined futures are not kept: `ForesightTrace.futures` is `None`. Arguments are those of [`UFRNN`].
     """
 
-    def __init__(self, network: SHLSTM, foresight: Foresight):
-        super().__init__(network, foresight)
+    def __init__(self, config: UFRNNConfig):
+        super().__init__(config)
+        network = self.network
         self._sizes = Sizes(
             network.joint_dim,
             network.feature_dim,
@@ -52,11 +58,12 @@ class FastUFRNN(UFRNN):
         self.advance(inputs, self.initial_memory(1), torch.Generator().manual_seed(0))
 
     def advance(
-        self, inputs: Tensor, memory: Memory, generator: Generator | None = None
+        self, inputs: Tensor, memory: Memory, generator: Generator | None = None, explore: bool = True
     ) -> tuple[Memory, ForesightTrace | None]:
         """See [`UFRNN.advance`]; carries no gradient."""
         with torch.no_grad(), torch.autocast(inputs.device.type, enabled=False):
-            prediction, state, trace = self._walk(inputs.unsqueeze(1), memory.state, generator, self._pack_once())
+            packed = self._pack_once()
+            prediction, state, trace = self._walk(inputs.unsqueeze(1), memory.state, generator, packed, explore)
         now = Prediction(*(values[0] for values in prediction))
         return Memory(state, now), None if trace is None else trace.at(0)
 
@@ -84,11 +91,17 @@ class FastUFRNN(UFRNN):
         return HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)
 
     def _walk(
-        self, inputs: Tensor, start: HiddenState, generator: Generator | None, packed: _Packed
+        self,
+        inputs: Tensor,
+        start: HiddenState,
+        generator: Generator | None,
+        packed: _Packed,
+        explore: bool = True,
     ) -> tuple[Prediction, HiddenState, ForesightTrace | None]:
         """Predictions over time (L, B, ...), the last state (B, ...) and the trace of all steps."""
         foresight, device = self.foresight, inputs.device
         options = _options(self.network, foresight)
+        options = options._replace(perturbs=explore and options.perturbs, selects=explore and options.selects)
         batch_size, length = inputs.shape[:2]
         noise = torch.empty(length, 1, batch_size, 0)
         if options.perturbs:
@@ -160,7 +173,7 @@ def _host(values: Tensor) -> Tensor:
 
 def _options(network: SHLSTM, foresight: Foresight) -> Options:
     low, high = network.log_variance_range
-    schedule = foresight.schedule
+    config = foresight.config
     columns, column = [], 0
     for name, size in zip(HiddenState._fields, network.state_sizes, strict=True):
         columns.append(column if name in foresight.perturbed else -1)
@@ -170,14 +183,14 @@ def _options(network: SHLSTM, foresight: Foresight) -> Options:
         float(high),
         foresight.exploration != "none",
         foresight.exploration == "foresight",
-        foresight.horizon,
-        foresight.learned_horizon,
-        foresight.baseline == "candidate",
-        foresight.aggregation == "entropy",
-        float(schedule.noise_range[0]),
-        float(schedule.noise_range[1]),
-        schedule.noise_unit == "variance",
-        schedule.log_scale,
+        config.horizon,
+        config.horizon_mode == "learned",
+        config.variance_baseline == "candidate",
+        config.variance_aggregation == "entropy",
+        float(config.noise_range[0]),
+        float(config.noise_range[1]),
+        config.noise_unit == "variance",
+        config.noise_scale == "log",
         tuple(columns),  # type: ignore[arg-type]
     )
 

@@ -3,11 +3,15 @@
 import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from .scaling import RangeScaler
+
+if TYPE_CHECKING:
+    from ..configuration_ufrnn import AutoencoderConfig
 
 
 class ConvAutoencoder(nn.Module):
@@ -20,29 +24,15 @@ class ConvAutoencoder(nn.Module):
     its first hundreds of updates on drawing the room.
 
     Args:
-        image_size (`tuple[int, int]`):
-            Height and width in pixels.
-        feature_dim (`int`):
-            Size of the bottleneck.
-        channels (`Sequence[int]`):
-            Output channels of each convolution; all but the first halve height and width.
-        hidden_dim (`int`):
-            Width of the linear layer between convolutions and bottleneck.
-        first_stride (`int`, *optional*, defaults to `16`):
-            By how much the first convolution divides height and width.
+        config (`AutoencoderConfig`):
+            Its `image_size`, `feature_dim`, `conv_channels`, `conv_first_stride` and `hidden_dim`.
     """
 
     background: Tensor
 
-    def __init__(
-        self,
-        image_size: tuple[int, int],
-        feature_dim: int,
-        channels: Sequence[int],
-        hidden_dim: int,
-        first_stride: int = 16,
-    ):
+    def __init__(self, config: "AutoencoderConfig"):
         super().__init__()
+        image_size, channels, first_stride = config.image_size, config.conv_channels, config.conv_first_stride
         self.register_buffer("background", torch.zeros(3, *image_size))
         sizes = [(math.ceil(image_size[0] / first_stride), math.ceil(image_size[1] / first_stride))]
         # What sticks out of the image is filled up with background (left, right, top, bottom) and cut off again.
@@ -57,14 +47,14 @@ class ConvAutoencoder(nn.Module):
         encoder: list[nn.Module] = [first, nn.ReLU()]
         for inside, outside in pairwise(channels):
             encoder += [nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.ReLU()]
-        bottleneck = nn.Linear(hidden_dim, feature_dim)
-        encoder += [nn.Flatten(), nn.Linear(flat_dim, hidden_dim), nn.ReLU(), bottleneck]
+        bottleneck = nn.Linear(config.hidden_dim, config.feature_dim)
+        encoder += [nn.Flatten(), nn.Linear(flat_dim, config.hidden_dim), nn.ReLU(), bottleneck]
         self.encoder = nn.Sequential(*encoder, nn.Tanh())
 
         self.expander = nn.Sequential(
-            nn.Linear(feature_dim, hidden_dim),
+            nn.Linear(config.feature_dim, config.hidden_dim),
             nn.ReLU(),
-            nn.Linear(hidden_dim, flat_dim),
+            nn.Linear(config.hidden_dim, flat_dim),
             nn.ReLU(),
             nn.Unflatten(1, (channels[-1], *sizes[-1])),
         )
@@ -89,7 +79,7 @@ class ConvAutoencoder(nn.Module):
         for parameter in last.parameters():  # so that the first reconstruction is the background itself
             nn.init.zeros_(parameter)
         # A feature that starts in the flat ends of tanh tends to stay there and tells little.
-        nn.init.normal_(bottleneck.weight, std=0.25 * math.sqrt(2 / hidden_dim))
+        nn.init.normal_(bottleneck.weight, std=0.25 * math.sqrt(2 / config.hidden_dim))
 
     @torch.no_grad()
     def fit_background(self, images: Tensor) -> None:
@@ -126,35 +116,17 @@ class ImageEncoder(nn.Module):
     Args:
         cameras (`Sequence[str]`):
             Camera keys, e.g. `observation.images.front`; their order is the order of the features.
-        image_size (`tuple[int, int]`):
-            Height and width in pixels that every image is resized to.
-        feature_dim (`int`):
-            Features per camera.
-        channels (`Sequence[int]`):
-            See [`ConvAutoencoder`].
-        hidden_dim (`int`):
-            See [`ConvAutoencoder`].
-        first_stride (`int`, *optional*, defaults to `16`):
-            See [`ConvAutoencoder`].
+        config (`AutoencoderConfig`):
+            What every camera's autoencoder looks like.
     """
 
-    def __init__(
-        self,
-        cameras: Sequence[str],
-        image_size: tuple[int, int],
-        feature_dim: int,
-        channels: Sequence[int],
-        hidden_dim: int,
-        first_stride: int = 16,
-    ):
+    def __init__(self, cameras: Sequence[str], config: "AutoencoderConfig"):
         super().__init__()
         self.cameras = tuple(cameras)
-        self.image_size = tuple(image_size)
-        self.feature_dim = feature_dim
-        self.autoencoders = nn.ModuleList(
-            ConvAutoencoder(image_size, feature_dim, channels, hidden_dim, first_stride) for _ in self.cameras
-        )
-        self.scaler = RangeScaler(feature_dim * len(self.cameras))
+        self.image_size = tuple(config.image_size)
+        self.feature_dim = config.feature_dim
+        self.autoencoders = nn.ModuleList(ConvAutoencoder(config) for _ in self.cameras)
+        self.scaler = RangeScaler(self.feature_dim * len(self.cameras))
 
     def by_camera(self) -> Iterator[tuple[str, ConvAutoencoder]]:
         """Camera keys with their autoencoders, in the order of the features."""

@@ -5,12 +5,15 @@ upper LSTM reads both and speaks back to both. Each lower LSTM predicts mean and
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from .gaussian import bound_log_variance
+
+if TYPE_CHECKING:
+    from ..configuration_ufrnn import UFRNNConfig
 
 
 class HiddenState(NamedTuple):
@@ -53,44 +56,24 @@ class SHLSTM(nn.Module):
     """Stochastic hierarchical LSTM.
 
     Args:
-        joint_dim (`int`):
-            Number of joints D_j, gripper included.
-        feature_dim (`int`):
-            Number of image features D_f, of all cameras together.
-        joint_hidden_dim (`int`):
-            Hidden size of `LSTM_joint`.
-        image_hidden_dim (`int`):
-            Hidden size of `LSTM_image`.
-        shared_hidden_dim (`int`):
-            Hidden size of `LSTM_shared`.
-        log_variance_range (`tuple[float, float]`):
-            Bounds of every predicted log-variance.
-        command_head (`bool`, *optional*, defaults to `True`):
-            Whether commands are read off by a head of their own; otherwise the predicted joints are commanded.
+        config (`UFRNNConfig`):
+            Its `joint_dim` D_j (gripper included) and `image_dim` D_f, the hidden sizes, `log_variance_range`, and
+            whether commands are read off by a head of their own (`command_target`).
     """
 
-    def __init__(
-        self,
-        joint_dim: int,
-        feature_dim: int,
-        joint_hidden_dim: int,
-        image_hidden_dim: int,
-        shared_hidden_dim: int,
-        log_variance_range: tuple[float, float],
-        command_head: bool = True,
-    ):
+    def __init__(self, config: "UFRNNConfig"):
         super().__init__()
-        self.joint_dim = joint_dim
-        self.feature_dim = feature_dim
-        self.log_variance_range = log_variance_range
+        self.joint_dim, self.feature_dim = config.joint_dim, config.image_dim
+        self.log_variance_range = config.log_variance_range
+        joint_hidden_dim, image_hidden_dim = config.joint_hidden_dim, config.image_hidden_dim
         lower_hidden_dim = joint_hidden_dim + image_hidden_dim
-        self.joint_cell = nn.LSTMCell(joint_dim, joint_hidden_dim)
-        self.image_cell = nn.LSTMCell(feature_dim, image_hidden_dim)
-        self.shared_cell = nn.LSTMCell(lower_hidden_dim, shared_hidden_dim)
-        self.shared_to_lower = nn.Linear(shared_hidden_dim, lower_hidden_dim)
-        self.joint_head = nn.Linear(joint_hidden_dim, 2 * joint_dim + 1)
-        self.image_head = nn.Linear(image_hidden_dim, 2 * feature_dim + 1)
-        self.command_head = nn.Linear(joint_hidden_dim, joint_dim) if command_head else None
+        self.joint_cell = nn.LSTMCell(self.joint_dim, joint_hidden_dim)
+        self.image_cell = nn.LSTMCell(self.feature_dim, image_hidden_dim)
+        self.shared_cell = nn.LSTMCell(lower_hidden_dim, config.shared_hidden_dim)
+        self.shared_to_lower = nn.Linear(config.shared_hidden_dim, lower_hidden_dim)
+        self.joint_head = nn.Linear(joint_hidden_dim, 2 * self.joint_dim + 1)
+        self.image_head = nn.Linear(image_hidden_dim, 2 * self.feature_dim + 1)
+        self.command_head = nn.Linear(joint_hidden_dim, self.joint_dim) if config.command_target == "action" else None
 
     @property
     def state_sizes(self) -> tuple[int, ...]:
@@ -100,15 +83,7 @@ class SHLSTM(nn.Module):
         )
 
     def initial_state(self, batch_size: int) -> HiddenState:
-        """Zero state, the same for every sequence: a learned state per sequence would leak what is to be found out.
-
-        Args:
-            batch_size (`int`):
-                Number of sequences B.
-
-        Returns:
-            `HiddenState`: zeros, (B, hidden size) each.
-        """
+        """Zeros, the same for every sequence: a learned state per sequence would leak what is to be found out."""
         weight = self.joint_head.weight
         return HiddenState(*(weight.new_zeros(batch_size, size) for size in self.state_sizes))
 
@@ -138,15 +113,7 @@ class SHLSTM(nn.Module):
         return HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)
 
     def predict(self, state: HiddenState) -> Prediction:
-        """Reads the prediction of the next sensor values off a hidden state.
-
-        Args:
-            state (`HiddenState`):
-                Any hidden state, (B, hidden size) each.
-
-        Returns:
-            `Prediction`: means, log-variances, step scalars and commands.
-        """
+        """Reads the prediction of the next sensor values off a hidden state (B, hidden size)."""
         joint = self.joint_head(state.h_joint)
         image = self.image_head(state.h_image)
         j, f = self.joint_dim, self.feature_dim

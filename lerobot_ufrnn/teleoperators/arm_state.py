@@ -9,53 +9,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_ufrnn.robots.ur5e_robotiq.client import import_client
 from lerobot_ufrnn.robots.ur5e_robotiq.gripper import closure_at
+from lerobot_ufrnn.robots.ur5e_robotiq.servo import import_client
 
-from .errors import ArmStateError
+from .configuration import TwistTeleoperatorConfig
+from .device import ArmStateError
 
 RTDE_PORT = 30004
+"""Where the controller tells its state."""
+
 RECEIVE_FREQUENCY = 125.0
+"""Packages a second that it is asked for."""
+
 STALE_SECONDS = 0.2
+"""Time without a new one after which nobody knows where the arm is."""
+
 TIMEOUT_SECONDS = 2.0
+"""Time that controller and gripper may take to answer."""
 
 
 class ArmState:
-    """Reads joints through a connection of its own (the controller serves several), and the gripper's target.
+    """Reads joints through a connection of its own (the controller serves several), and the gripper's target."""
 
-    Args:
-        robot_ip (`str`):
-            Address of the controller.
-        gripper_port (`int`, *optional*, defaults to `63352`):
-            Port of the gripper's socket; 0 if there is none.
-        gripper_range (`tuple[int, int]`, *optional*, defaults to `(3, 230)`):
-            The gripper's readings when it is open and closed.
-        clock (`Callable[[], float]`, *optional*, defaults to `time.monotonic`):
-            Time in seconds.
-    """
-
-    def __init__(
-        self,
-        robot_ip: str,
-        gripper_port: int = 63352,
-        gripper_range: tuple[int, int] = (3, 230),
-        clock: Callable[[], float] = time.monotonic,
-    ):
-        self._ip = robot_ip
-        self._gripper_port = gripper_port
-        self._gripper_range = gripper_range
+    def __init__(self, config: TwistTeleoperatorConfig, clock: Callable[[], float] = time.monotonic):
+        self._ip = config.robot_ip
+        self._gripper_port = config.gripper_port
+        self._gripper_range = config.gripper_range
         self._clock = clock
         self._receive: Any = None
         self._stamp: float | None = None
         self._stamped = 0.0
 
     def open(self) -> None:
-        """Connects to the controller.
-
-        Raises:
-            ImportError: If `ur_rtde` is not installed; says how to install it.
-            ArmStateError: If the controller cannot be reached.
-        """
+        """Connects to the controller; an `ImportError` or an `ArmStateError` says what that lacks."""
         _, rtde_receive, _ = import_client("Teleoperating the arm")
         try:
             # The client's constructor cannot be interrupted; find out in a way that can whether anybody is there.
@@ -70,14 +56,7 @@ class ArmState:
         self._stamp, self._stamped = self._receive.getTimestamp(), self._clock()
 
     def joints(self) -> NDArray[np.float64]:
-        """The measured joints.
-
-        Returns:
-            `NDArray[np.float64]`: joint angles in rad, (6,).
-
-        Raises:
-            ArmStateError: If they are not known, or not known to be recent.
-        """
+        """The measured joint angles in rad, (6,); raises an `ArmStateError` if they are not known to be recent."""
         if self._receive is None or not self._receive.isConnected():
             raise ArmStateError(
                 f"The connection to the arm's controller at {self._ip} broke, so nobody knows where the arm is: "
@@ -101,13 +80,10 @@ class ArmState:
         return joints
 
     def gripper_target(self) -> float:
-        """The gripper's target that is in force; the measured closure would loosen a grip around something.
+        """The gripper's target that is in force, 0, open, to 1, closed; 0 without a gripper.
 
-        Returns:
-            `float`: 0, open, to 1, closed; 0 without a gripper.
-
-        Raises:
-            ArmStateError: If the gripper does not answer.
+        The measured closure would loosen a grip around something. A gripper that does not answer raises an
+        `ArmStateError`.
         """
         if self._gripper_port == 0:
             return 0.0

@@ -1,14 +1,27 @@
-"""What every input device looks like to the teleoperator."""
+"""What every input device looks like to the teleoperator, and what it cannot go on from by itself."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import numpy as np
+from lerobot.utils.errors import DeviceNotConnectedError
 from numpy.typing import NDArray
 
 OPEN, CLOSE = "open", "close"
 BUTTONS = (OPEN, CLOSE)
 """Buttons that mean something: the gripper opens or closes while they are held."""
+
+
+class DeviceUnavailableError(ConnectionError):
+    """The input device cannot be opened: a library, a permission or the device itself is missing."""
+
+
+class DeviceLostError(DeviceNotConnectedError):
+    """The input device was there and is gone."""
+
+
+class ArmStateError(DeviceNotConnectedError):
+    """Nobody knows where the arm is, so no target for it can be called safe."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +40,7 @@ class DeviceState:
     buttons: frozenset[str] = frozenset()
 
     def fault(self) -> str | None:
-        """What is wrong with the state, if anything.
-
-        Returns:
-            `str | None`: the reason why nothing may be done with it.
-        """
+        """`str | None`: what is wrong with the state, if anything, so that nothing may be done with it."""
         if np.shape(self.twist) != (6,):
             return f"the device gave a twist of shape {np.shape(self.twist)} instead of (6,)"
         if not np.isfinite(self.twist).all():
@@ -46,21 +55,13 @@ class TwistDevice(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Gets ready to be read.
-
-        Raises:
-            DeviceUnavailableError: If the device cannot be used; says what is missing.
-        """
+        """Gets ready to be read; a `DeviceUnavailableError` says what is missing."""
 
     @abstractmethod
     def read(self) -> DeviceState:
-        """The latest state, at once; at rest where the device has not been heard of lately.
+        """What the operator wants now, at once; at rest where the device has not been heard of lately.
 
-        Returns:
-            `DeviceState`: what the operator wants now.
-
-        Raises:
-            DeviceLostError: If the device is gone.
+        Raises a `DeviceLostError` if the device is gone.
         """
 
     @abstractmethod

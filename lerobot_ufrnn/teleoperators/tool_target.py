@@ -14,8 +14,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from env_door.kinematics import InverseKinematics, UnreachableError, rotation_about, rotation_vector
+from env_door.kinematics import InverseKinematics, UnreachableError, rotation_about
 from env_door.scene import UR5E, load_model
+
+from .configuration import TwistTeleoperatorConfig
 
 MAX_ITERATIONS = 30
 """Iterations of the inverse kinematics; a step of a few centimetres takes about three."""
@@ -23,8 +25,8 @@ MAX_ITERATIONS = 30
 MAX_CHANGE = 0.3
 """Largest joint step in rad that belongs to a small step of the tool; a larger one is another way to hold the arm."""
 
-PROBE = 1e-6
-"""Joint step in rad for the Jacobian by central differences."""
+MIN_PROGRESS = 0.05
+"""Share of a step below which the arm counts as blocked."""
 
 
 class Hindrance(Enum):
@@ -37,21 +39,12 @@ class Hindrance(Enum):
 
 
 class ToolTarget:
-    """Where the tool is to be, and the joint targets for it.
+    """Where the tool is to be, and the joint targets for it."""
 
-    Args:
-        joint_speed (`float`, *optional*, defaults to `0.6`):
-            Largest speed of a joint target in rad/s.
-        max_lead (`float`, *optional*, defaults to `0.07`):
-            Largest distance in rad between a joint target and the measured joint.
-        min_manipulability (`float`, *optional*, defaults to `0.01`):
-            Manipulability (m^3) below which the tool is led only to where it is higher.
-    """
-
-    def __init__(self, joint_speed: float = 0.6, max_lead: float = 0.07, min_manipulability: float = 0.01):
-        self._joint_speed = joint_speed
-        self._max_lead = max_lead
-        self._min_manipulability = min_manipulability
+    def __init__(self, config: TwistTeleoperatorConfig):
+        self._joint_speed = config.joint_speed
+        self._max_lead = config.max_lead
+        self._min_manipulability = config.min_manipulability
         model = load_model(UR5E.name)
         self._kinematics = InverseKinematics(model, UR5E.joints, max_iterations=MAX_ITERATIONS)
         self._ranges = np.array([model.joint(name).range for name in UR5E.joints])
@@ -60,17 +53,9 @@ class ToolTarget:
         self._position, self._rotation = self._kinematics.forward(self._joints)
 
     def start(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Makes the target where the arm is.
+        """Makes the target where the arm is, at measured joints in rad, (6,), which it returns.
 
-        Args:
-            joints (`NDArray[np.float64]`):
-                Measured joints in rad, (6,).
-
-        Returns:
-            `NDArray[np.float64]`: the same joints.
-
-        Raises:
-            ValueError: If a joint is beyond its range, from where the inverse kinematics would take it back at once.
+        Raises a `ValueError` if one is beyond its range, from where the inverse kinematics would take it back at once.
         """
         outside = (joints < self._ranges[:, 0]) | (joints > self._ranges[:, 1])
         if outside.any():
@@ -89,18 +74,10 @@ class ToolTarget:
         return self._rotation
 
     def step(self, twist: NDArray[np.float64], seconds: float, measured: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Moves the target on; `hindrance` says afterwards if something is in the way.
+        """Joint targets in rad, (6,), within `max_lead` of the measured ones.
 
-        Args:
-            twist (`NDArray[np.float64]`):
-                Velocity (m/s) and angular velocity (rad/s) of the tool in the frame of the arm's base, (6,).
-            seconds (`float`):
-                For how long.
-            measured (`NDArray[np.float64]`):
-                Measured joints in rad, (6,).
-
-        Returns:
-            `NDArray[np.float64]`: joint targets in rad, (6,), within `max_lead` of the measured ones.
+        The twist, velocity (m/s) and angular velocity (rad/s) of the tool in the frame of the arm's base, (6,), lasts
+        for some seconds. `hindrance` says afterwards if something is in the way.
         """
         self.hindrance = None
         low, high = measured - self._max_lead, measured + self._max_lead
@@ -144,7 +121,7 @@ class ToolTarget:
         room = np.where(change > 0, high - self._joints, low - self._joints)
         share = min(1.0, float(np.min(self._joint_speed * seconds / np.abs(change[moving]), initial=1.0)))
         free = float(np.min(room[moving] / change[moving], initial=1.0))
-        if free < 0.05 * share:
+        if free < MIN_PROGRESS * share:
             self.hindrance = self.hindrance or Hindrance.BLOCKED
         share = max(0.0, min(share, free))
         if share < 1.0:
@@ -158,15 +135,7 @@ class ToolTarget:
         self._position, self._rotation = self._kinematics.forward(joints)
 
     def _manipulability(self, joints: NDArray[np.float64]) -> float:
-        jacobian = np.empty((6, 6))
-        for index in range(6):
-            probe = np.zeros(6)
-            probe[index] = PROBE
-            ahead, ahead_rotation = self._kinematics.forward(joints + probe)
-            behind, behind_rotation = self._kinematics.forward(joints - probe)
-            jacobian[:3, index] = (ahead - behind) / (2 * PROBE)
-            jacobian[3:, index] = rotation_vector(ahead_rotation @ behind_rotation.T) / (2 * PROBE)
-        return abs(float(np.linalg.det(jacobian)))
+        return abs(float(np.linalg.det(self._kinematics.jacobian(joints))))
 
 
 def _turn(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,16 +12,14 @@ from lerobot.teleoperators import Teleoperator
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 from numpy.typing import NDArray
 
-from lerobot_ufrnn.robots.ur5e_robotiq.configuration_ur5e_robotiq import FEATURES
+from lerobot_ufrnn.robots.ur5e_robotiq.configuration import FEATURES
 
 from .arm_state import ArmState
-from .configuration_twist import KeyboardTwistConfig, SpaceMouseTwistConfig, TwistTeleoperatorConfig
+from .configuration import KeyboardTwistConfig, SpaceMouseTwistConfig, TwistTeleoperatorConfig
 from .device import CLOSE, OPEN, DeviceState, TwistDevice
-from .event_stream import EventRecorder, EventStreamDevice
-from .key_sources import make_key_source
-from .keyboard_device import KeyboardDevice
-from .notices import Notices
-from .spacemouse_device import SpaceMouseDevice
+from .events import EventStreamDevice
+from .keyboard import KeyboardDevice
+from .spacemouse import SpaceMouseDevice
 from .tool_target import ToolTarget
 
 logger = logging.getLogger(__name__)
@@ -31,6 +29,9 @@ MAX_STEP_SECONDS = 0.25
 
 PAUSE_SECONDS = 1.0
 """Time without an action after which the target starts from where the arm is, as it did at first."""
+
+SILENCE_SECONDS = 2.0
+"""Time that a condition must have been over before the operator is told of it again."""
 
 TOOL_FROM_OPERATOR = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 """Ahead, left and up in the tool's own axes: z points ahead, and with the gripper level x points up."""
@@ -43,14 +44,12 @@ class TwistTeleoperator(Teleoperator):
     1, closed. So the stock `lerobot-teleoperate` and `lerobot-record` need no processors, and what they record is
     what a policy of the simulated door is trained on.
 
-    **Where it starts.** The stock loops call `get_action()` without saying where the arm is, and call `send_feedback`
-    for one humanoid only; they connect the teleoperator before the robot. A pose from the configuration would be a
-    guess, and a wrong guess a jump. So the teleoperator asks the arm's controller itself, through a connection of its
-    own that can only read, and it does so when the *first action* is asked for, when the robot is connected and
-    at rest. That first action is the measured pose itself, whatever the device says, with the gripper's target in
-    force. The connection stays open: every later target lies within `max_lead` of the joints measured at that moment,
-    so that there cannot be a jump later either, be the arm blocked or moved by somebody else. After a pause of more
-    than a second, such as LeRobot makes to save an episode, it starts anew from where the arm is.
+    **Where it starts.** The stock loops connect the teleoperator before the robot and never tell it where the arm is; a
+    pose from the configuration would be a guess, and a wrong guess a jump. So it asks the arm's controller itself,
+    through a connection of its own that can only read, when the *first action* is asked for: that is the measured pose,
+    whatever the device says, with the gripper's target in force. Every later target lies within `max_lead` of the
+    joints measured at that moment, be the arm blocked or moved by somebody else. After a pause of more than a second,
+    such as LeRobot makes to save an episode, it starts anew from where the arm is.
 
     **When something is wrong.** A device that is silent or gives nonsense counts as at rest: the arm holds. A device
     that is gone, or an arm whose place is not known any more, ends `get_action()` with an error that says what to do;
@@ -73,7 +72,7 @@ class TwistTeleoperator(Teleoperator):
         self.config = config
         self.clock = monotonic
         self._scale = np.array([config.linear_speed] * 3 + [config.angular_speed] * 3)
-        self._notices = Notices(logger)
+        self._noticed: dict[str, float] = {}
         self._arm: ArmState | None = None
         self._device: TwistDevice | None = None
         self._target: ToolTarget | None = None
@@ -82,11 +81,7 @@ class TwistTeleoperator(Teleoperator):
 
     @abstractmethod
     def make_own_device(self) -> TwistDevice:
-        """The input device of this type.
-
-        Returns:
-            `TwistDevice`: not opened yet.
-        """
+        """The input device of this type, not opened yet."""
 
     @property
     def action_features(self) -> dict[str, type]:
@@ -118,25 +113,21 @@ class TwistTeleoperator(Teleoperator):
     def connect(self, calibrate: bool = True) -> None:
         """Opens the device and the connection to the arm's controller; nothing moves.
 
-        Args:
-            calibrate (`bool`, *optional*, defaults to `True`):
-                Of no effect.
-
         Raises:
             DeviceUnavailableError: If the device cannot be used.
             ArmStateError: If the controller cannot be reached.
             ImportError: If a library is missing.
         """
         config = self.config
-        arm = ArmState(config.robot_ip, config.gripper_port, config.gripper_range, self.clock)
-        device = self._make_device()
+        arm = ArmState(config, self.clock)
+        device = self.make_own_device() if config.device is None else EventStreamDevice(config.device, self.clock)
         arm.open()
         try:
             device.open()
         except BaseException:
             arm.close()
             raise
-        self._target = ToolTarget(config.joint_speed, config.max_lead, config.min_manipulability)
+        self._target = ToolTarget(config)
         self._arm, self._device, self._last = arm, device, None
 
     @check_if_not_connected
@@ -165,7 +156,7 @@ class TwistTeleoperator(Teleoperator):
             seconds = min(now - self._last, MAX_STEP_SECONDS)
             joints = self._target.step(self._in_base(state.twist * self._scale), seconds, measured)
             if self._target.hindrance is not None:
-                self._notices.tell(self._target.hindrance.value, now)
+                self._notice(self._target.hindrance.value, now)
             closing = (CLOSE in state.buttons) - (OPEN in state.buttons)
             self._gripper = float(np.clip(self._gripper + closing * self.config.gripper_speed * seconds, 0.0, 1.0))
         self._last = now
@@ -173,12 +164,7 @@ class TwistTeleoperator(Teleoperator):
         return dict(zip(FEATURES, values, strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Nothing to do: the stock loops call this for other robots only, so nothing may depend on it.
-
-        Args:
-            feedback (`dict[str, Any]`):
-                Ignored.
-        """
+        """Nothing to do: the stock loops call this for other robots only, so nothing may depend on it."""
 
     @check_if_not_connected
     def disconnect(self) -> None:
@@ -190,18 +176,20 @@ class TwistTeleoperator(Teleoperator):
                 with contextlib.suppress(Exception):
                     part.close()
 
-    def _make_device(self) -> TwistDevice:
-        config = self.config
-        device = self.make_own_device() if config.device is None else EventStreamDevice(config.device, self.clock)
-        return device if config.record_events is None else EventRecorder(device, config.record_events, self.clock)
-
     def _read_device(self) -> DeviceState:
         assert self._device is not None
         state = self._device.read()
         if (fault := state.fault()) is not None:
-            self._notices.tell(f"The arm holds: {fault}.", self.clock(), kind="fault")
+            self._notice(f"The arm holds: {fault}.", self.clock(), kind="fault")
             return DeviceState()
         return DeviceState(np.clip(state.twist, -1.0, 1.0), state.buttons)
+
+    def _notice(self, message: str, now: float, kind: str = "") -> None:
+        """Tells the operator of a condition once, not at every step that it lasts."""
+        before = self._noticed.get(kind or message, -np.inf)
+        self._noticed[kind or message] = now
+        if now - before > SILENCE_SECONDS:
+            logger.warning(message)
 
     def _in_base(self, twist: NDArray[np.float64]) -> NDArray[np.float64]:
         if self.config.frame == "base":
@@ -211,12 +199,7 @@ class TwistTeleoperator(Teleoperator):
 
 
 class SpaceMouseTwist(TwistTeleoperator):
-    """`--teleop.type=spacemouse_twist`.
-
-    Args:
-        config (`SpaceMouseTwistConfig`):
-            See there.
-    """
+    """`--teleop.type=spacemouse_twist`."""
 
     config_class = SpaceMouseTwistConfig
     name = "spacemouse_twist"
@@ -224,16 +207,11 @@ class SpaceMouseTwist(TwistTeleoperator):
 
     def make_own_device(self) -> TwistDevice:
         """The SpaceMouse."""
-        return SpaceMouseDevice(self.config.deadzone, self.config.stale_after)
+        return SpaceMouseDevice(self.config)
 
 
 class KeyboardTwist(TwistTeleoperator):
-    """`--teleop.type=keyboard_twist`.
-
-    Args:
-        config (`KeyboardTwistConfig`):
-            See there.
-    """
+    """`--teleop.type=keyboard_twist`."""
 
     config_class = KeyboardTwistConfig
     name = "keyboard_twist"
@@ -241,4 +219,4 @@ class KeyboardTwist(TwistTeleoperator):
 
     def make_own_device(self) -> TwistDevice:
         """The keyboard."""
-        return KeyboardDevice(make_key_source(self.config.keys, self.config.key_hold))
+        return KeyboardDevice()

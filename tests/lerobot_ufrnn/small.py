@@ -6,7 +6,13 @@ import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_ufrnn import UFRNNConfig
+from lerobot_ufrnn.configuration_ufrnn import (
+    AugmentationConfig,
+    AutoencoderConfig,
+    ForesightConfig,
+    RecallConfig,
+    UFRNNConfig,
+)
 
 JOINTS = ("shoulder_pan.pos", "elbow.pos", "gripper.pos")
 IMAGE_SIZE = 32
@@ -57,24 +63,27 @@ def make_dataset(
     return LeRobotDataset("test/motions", root=root, video_backend="pyav")
 
 
-def small_config(**overrides) -> UFRNNConfig:
-    """A configuration that trains in a blink."""
-    settings = {
-        "device": "cpu",
-        "num_samples": 3,
-        "horizon": 2,
-        "joint_hidden_dim": 6,
-        "image_hidden_dim": 5,
-        "shared_hidden_dim": 4,
-        "image_size": (IMAGE_SIZE, IMAGE_SIZE),
-        "feature_dim": 4,
-        "conv_channels": (4, 4),
-        "conv_first_stride": 4,
-        "autoencoder_hidden_dim": 8,
-        "autoencoder_steps": 2,
-        "autoencoder_batch_size": 4,
-    }
-    return UFRNNConfig(**{**settings, **overrides})
+AUTOENCODER = {
+    "image_size": (IMAGE_SIZE, IMAGE_SIZE),
+    "feature_dim": 4,
+    "conv_channels": (4, 4),
+    "conv_first_stride": 4,
+    "hidden_dim": 8,
+    "steps": 2,
+    "batch_size": 4,
+}
+
+
+def small_config(foresight=(), recall=(), autoencoder=(), augmentation=(), **overrides) -> UFRNNConfig:
+    """A configuration that trains in a blink; groups are given as dictionaries."""
+    return UFRNNConfig(
+        device="cpu",
+        foresight=ForesightConfig(**{"num_samples": 3, "horizon": 2, **dict(foresight)}),
+        recall=RecallConfig(**dict(recall)),
+        autoencoder=AutoencoderConfig(**{**AUTOENCODER, **dict(autoencoder)}),
+        augmentation=AugmentationConfig(**dict(augmentation)),
+        **{"joint_hidden_dim": 6, "image_hidden_dim": 5, "shared_hidden_dim": 4, **overrides},
+    )
 
 
 def batch_of(*episodes: int) -> dict[str, torch.Tensor]:

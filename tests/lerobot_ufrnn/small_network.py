@@ -2,30 +2,46 @@
 
 import numpy as np
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from oracle import Oracle
+from small import IMAGE_SIZE, small_config
 
-from lerobot_ufrnn.foresight import Foresight, NoiseSchedule
+from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
+from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.networks import SHLSTM, HiddenState
-from lerobot_ufrnn.recurrent import UFRNN
 
 JOINTS, FEATURES = 3, 4
 
 
-def small_network(hidden_dim: int = 6) -> SHLSTM:
-    """Larger weights than at the start, so that its states move; it is equally certain of its joints everywhere."""
-    torch.manual_seed(0)
-    network = SHLSTM(JOINTS, FEATURES, hidden_dim, 5, 4, (-9.0, 3.0)).double()
-    for parameter in network.parameters():
+def network_config(joint_dim: int = JOINTS, feature_dim: int = FEATURES, **overrides) -> UFRNNConfig:
+    """A configuration of a small network with so many inputs, `feature_dim` from one camera."""
+    joints = PolicyFeature(FeatureType.STATE, (joint_dim,))
+    return small_config(
+        autoencoder={"feature_dim": feature_dim},
+        input_features={
+            "observation.state": joints,
+            "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (joint_dim,))},
+        **overrides,
+    )
+
+
+def enlarge(network: SHLSTM) -> SHLSTM:
+    """In float64 and with larger weights than at the start, so that its states move and candidates part."""
+    for parameter in network.double().parameters():
         parameter.data.mul_(2)
-    network.joint_head.weight.data[JOINTS : 2 * JOINTS] = 0
-    network.joint_head.bias.data[JOINTS : 2 * JOINTS] = torch.tensor([-4.0, -4.5, -5.0])
-    return network.requires_grad_(False)
+    return network
 
 
-def small_model(hidden_dim: int = 6) -> UFRNN:
-    """The small network in a model that does not explore."""
-    schedule = NoiseSchedule((0.05, 0.15), "std", False)
-    return UFRNN(small_network(hidden_dim), Foresight("none", schedule, num_samples=1, horizon=1))
+def small_model(kernel: type[UFRNN] = UFRNN, **overrides) -> UFRNN:
+    """A model that does not explore unless told to; it is equally certain of its joints everywhere."""
+    torch.manual_seed(0)
+    model = kernel(network_config(**{"exploration": "none", **overrides})).double()
+    head = enlarge(model.network).joint_head
+    head.weight.data[JOINTS : 2 * JOINTS] = 0
+    head.bias.data[JOINTS : 2 * JOINTS] = torch.tensor([-4.0, -4.5, -5.0])
+    return model.requires_grad_(False)
 
 
 def random_state(network: SHLSTM, rows: int, seed: int = 0) -> HiddenState:

@@ -4,34 +4,32 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import Oracle
+from small_network import enlarge, network_config, small_model
 
-from lerobot_ufrnn.foresight import (
-    PERTURBED_STATES,
-    Foresight,
-    NoiseSchedule,
-    perturb,
-    sample_noise,
-    select,
-)
+from lerobot_ufrnn.configuration_ufrnn import ForesightConfig
+from lerobot_ufrnn.foresight import PERTURBED_STATES, Foresight, NoiseSchedule, perturb, select
 from lerobot_ufrnn.networks import SHLSTM, HiddenState, Prediction
-from lerobot_ufrnn.recurrent import UFRNN
 
 FIELDS = HiddenState._fields
 
 
 def make_network(joint_dim=3, feature_dim=4, seed=0) -> SHLSTM:
     torch.manual_seed(seed)
-    network = SHLSTM(joint_dim, feature_dim, 6, 5, 4, (-9.0, 3.0)).double()
-    for parameter in network.parameters():  # larger weights than at the start, so that candidates part
-        parameter.data.mul_(2)
-    return network
+    return enlarge(SHLSTM(network_config(joint_dim, feature_dim)))
 
 
-def make_schedule(**overrides) -> NoiseSchedule:
-    schedule = NoiseSchedule(**{"noise_range": (0.05, 0.15), "noise_unit": "variance", "log_scale": False, **overrides})
+def make_foresight(exploration="foresight", **settings_) -> Foresight:
+    """Noise from 0.05 to 0.15 as variance, over a known range of predicted variances."""
+    config = network_config(exploration=exploration, foresight={"noise_unit": "variance", **settings_})
+    foresight = Foresight(config)
+    set_range(foresight.schedule)
+    return foresight
+
+
+def set_range(schedule: NoiseSchedule) -> NoiseSchedule:
     schedule.double()
     low, high = torch.tensor([[0.1, 0.2], [2.0, 3.0]], dtype=torch.float64)
-    if schedule.log_scale:
+    if schedule.config.noise_scale == "log":
         low, high = low.log(), high.log()
     schedule.low.copy_(low)
     schedule.high.copy_(high)
@@ -73,15 +71,15 @@ def oracle_foresight(network, schedule, state, previous, noise, settings_):
                 candidate.append(vector)
             _, own_log_variance, step, _ = oracle.predict(candidate)
             horizon = settings_["horizon"]
-            if settings_.get("learned_horizon"):
+            if settings_["horizon_mode"] == "learned":
                 horizon = int(np.ceil(horizon * (1 / (1 + np.exp(-step))).max()))
-            final = oracle.uncertainty(oracle.imagine(candidate, horizon)[-1][1], settings_["aggregation"])
+            final = oracle.uncertainty(oracle.imagine(candidate, horizon)[-1][1], settings_["variance_aggregation"])
             start = (
                 own_log_variance
-                if settings_["baseline"] == "candidate"
+                if settings_["variance_baseline"] == "candidate"
                 else previous.log_variance[row].detach().numpy()
             )
-            fall = oracle.uncertainty(start, settings_["aggregation"]) - final
+            fall = oracle.uncertainty(start, settings_["variance_aggregation"]) - final
             row_finals.append(final)
             if fall > best_fall:
                 best, best_fall, best_candidate = n, fall, candidate
@@ -99,38 +97,19 @@ def oracle_foresight(network, schedule, state, previous, noise, settings_):
     num_samples=st.integers(1, 6),
     horizon=st.integers(1, 7),
     perturbed_states=st.sampled_from(sorted(PERTURBED_STATES)),
-    baseline=st.sampled_from(["common", "candidate"]),
-    aggregation=st.sampled_from(["variance", "entropy"]),
-    learned_horizon=st.booleans(),
+    variance_baseline=st.sampled_from(["common", "candidate"]),
+    variance_aggregation=st.sampled_from(["variance", "entropy"]),
+    horizon_mode=st.sampled_from(["fixed", "learned"]),
     seed=st.integers(0, 1000),
 )
-def test_foresight_equals_the_brute_force_oracle(
-    joint_dim,
-    feature_dim,
-    batch_size,
-    num_samples,
-    horizon,
-    perturbed_states,
-    baseline,
-    aggregation,
-    learned_horizon,
-    seed,
-):
-    network, schedule = make_network(joint_dim, feature_dim, seed), make_schedule()
+def test_foresight_equals_the_brute_force_oracle(joint_dim, feature_dim, batch_size, seed, **choice):
+    network, foresight = make_network(joint_dim, feature_dim, seed), make_foresight(**choice)
     state, previous = random_moment(network, batch_size, seed)
-    choice = {
-        "num_samples": num_samples,
-        "horizon": horizon,
-        "baseline": baseline,
-        "aggregation": aggregation,
-        "learned_horizon": learned_horizon,
-    }
-    foresight = Foresight("foresight", schedule, perturbed_states=perturbed_states, **choice)
     kept, trace = foresight(network, state, previous, torch.Generator().manual_seed(seed))
-    fields = PERTURBED_STATES[perturbed_states]
-    joined = sample_noise(state, num_samples, fields, generator=torch.Generator().manual_seed(seed))
+    fields = PERTURBED_STATES[choice["perturbed_states"]]
+    joined = foresight.sample_noise(state, torch.Generator().manual_seed(seed))
     noise = dict(zip(fields, joined.split([getattr(state, name).shape[-1] for name in fields], -1), strict=True))
-    chosen, expected, finals = oracle_foresight(network, schedule, state, previous, noise, choice)
+    chosen, expected, finals = oracle_foresight(network, foresight.schedule, state, previous, noise, choice)
     np.testing.assert_allclose(trace.final.numpy(), finals, rtol=1e-9)
     np.testing.assert_array_equal(trace.chosen.numpy(), chosen)
     for row, candidate in enumerate(expected):
@@ -141,7 +120,7 @@ def test_foresight_equals_the_brute_force_oracle(
 def test_roll_out_feeds_the_predicted_means_back():
     network = make_network()
     state, previous = random_moment(network, 2, 0)
-    foresight = Foresight("foresight", make_schedule(), num_samples=1, horizon=4)
+    foresight = make_foresight(num_samples=1, horizon=4)
     kept, trace = foresight(network, state, previous, torch.Generator().manual_seed(1))
     futures = Oracle(network).imagine([value[1].detach().numpy() for value in kept], 4)
     for step, (mean, log_variance, *_) in enumerate(futures):
@@ -153,7 +132,7 @@ def test_the_kept_state_carries_the_gradient_of_the_state_and_nothing_else():
     network = make_network()
     state, previous = random_moment(network, 2, 0)
     leaves = HiddenState(*(value.detach().requires_grad_() for value in state))
-    kept, trace = Foresight("foresight", make_schedule(), num_samples=4, horizon=3)(network, leaves, previous)
+    kept, trace = make_foresight(num_samples=4, horizon=3)(network, leaves, previous)
     sum(value.sum() for value in kept).backward()
     for leaf in leaves:
         torch.testing.assert_close(leaf.grad, torch.ones_like(leaf))
@@ -164,7 +143,7 @@ def test_the_kept_state_carries_the_gradient_of_the_state_and_nothing_else():
 def test_exploration_none_leaves_the_state_alone():
     network = make_network()
     state, previous = random_moment(network, 2, 0)
-    kept, trace = Foresight("none", make_schedule(), num_samples=5, horizon=3)(network, state, previous)
+    kept, trace = make_foresight("none", num_samples=5, horizon=3)(network, state, previous)
     assert kept is state
     assert trace is None
 
@@ -173,12 +152,10 @@ def test_exploration_noise_is_the_first_candidate_of_foresight():
     """The baseline SH-RNN+noise takes one draw of the same noise and does not select."""
     network = make_network()
     state, previous = random_moment(network, 2, 0)
-    kept, trace = Foresight("noise", make_schedule(), num_samples=5, horizon=3)(
+    kept, trace = make_foresight("noise", num_samples=5, horizon=3)(
         network, state, previous, torch.Generator().manual_seed(3)
     )
-    only, _ = Foresight("foresight", make_schedule(), num_samples=1, horizon=3)(
-        network, state, previous, torch.Generator().manual_seed(3)
-    )
+    only, _ = make_foresight(num_samples=1, horizon=3)(network, state, previous, torch.Generator().manual_seed(3))
     assert trace is None
     for ours, theirs in zip(kept, only, strict=True):
         torch.testing.assert_close(ours, theirs)
@@ -190,8 +167,9 @@ def test_exploration_noise_is_the_first_candidate_of_foresight():
 def test_only_the_named_states_are_perturbed(perturbed_states, moved):
     network = make_network()
     state, _ = random_moment(network, 2, 0)
-    fields = PERTURBED_STATES[perturbed_states]
-    candidates = perturb(state, sample_noise(state, 3, fields), torch.full((2, 2), 0.3, dtype=torch.float64), fields)
+    foresight = make_foresight(num_samples=3, perturbed_states=perturbed_states)
+    std = torch.full((2, 2), 0.3, dtype=torch.float64)
+    candidates = perturb(state, foresight.sample_noise(state), std, PERTURBED_STATES[perturbed_states])
     for name in FIELDS:
         same = torch.equal(getattr(candidates, name), getattr(state, name).repeat(3, 1))
         assert same != name.startswith(moved)
@@ -200,16 +178,16 @@ def test_only_the_named_states_are_perturbed(perturbed_states, moved):
 def test_perturbed_states_have_the_asked_spread():
     network = make_network()
     state = network.initial_state(1)
-    fields = PERTURBED_STATES["hidden"]
-    noise = sample_noise(state, 20000, fields, generator=torch.Generator().manual_seed(0))
-    candidates = perturb(state, noise, torch.tensor([[0.2, 0.4]], dtype=torch.float64), fields)
+    noise = make_foresight(num_samples=20000).sample_noise(state, torch.Generator().manual_seed(0))
+    std = torch.tensor([[0.2, 0.4]], dtype=torch.float64)
+    candidates = perturb(state, noise, std, PERTURBED_STATES["hidden"])
     for name, std in (("h_joint", 0.2), ("h_image", 0.4), ("h_shared", 0.3)):
         assert getattr(candidates, name).std().item() == pytest.approx(std, rel=0.02)
 
 
 def test_the_unperturbed_state_can_be_a_candidate():
     state, _ = random_moment(make_network(), 2, 0)
-    noise = sample_noise(state, 3, PERTURBED_STATES["hidden"], keep_unperturbed=True)
+    noise = make_foresight(num_samples=3, keep_unperturbed=True).sample_noise(state)
     assert (noise[0] == 0).all()
     assert (noise[1:] != 0).all()
 
@@ -229,20 +207,20 @@ def test_select_takes_the_largest_fall():
     ],
 )
 def test_noise_follows_the_place_of_the_variance_in_its_range(overrides, expected):
-    schedule = make_schedule(**overrides)
+    schedule = set_range(NoiseSchedule(ForesightConfig(**{"noise_unit": "variance", **overrides})))
     joints = torch.tensor([0.1, 1.05, 2.0, 0.0, 50.0], dtype=torch.float64)
     std = schedule(torch.stack([joints, joints], dim=-1))
     np.testing.assert_allclose(std[:, 0].numpy(), expected, rtol=1e-12)
 
 
 def test_noise_on_a_log_scale():
-    schedule = make_schedule(log_scale=True, noise_unit="std")
+    schedule = set_range(NoiseSchedule(ForesightConfig(noise_scale="log")))
     middle = torch.tensor([[0.1, 0.2], [2.0, 3.0]], dtype=torch.float64).log().mean(0).exp()
     np.testing.assert_allclose(schedule(middle).numpy(), [0.1, 0.1], rtol=1e-12)
 
 
 def test_the_range_starts_with_the_first_update_and_follows_training():
-    schedule = NoiseSchedule((0.05, 0.15), "std", False).double()
+    schedule = NoiseSchedule(ForesightConfig()).double()
     early = torch.linspace(0, 10, 101, dtype=torch.float64)[:, None].expand(-1, 2)
     schedule.observe(early)
     np.testing.assert_allclose([schedule.low[0], schedule.high[0]], [0.5, 9.5])
@@ -252,7 +230,7 @@ def test_the_range_starts_with_the_first_update_and_follows_training():
 
 
 def test_one_outlier_does_not_set_the_range():
-    schedule = NoiseSchedule((0.05, 0.15), "std", False).double()
+    schedule = NoiseSchedule(ForesightConfig()).double()
     values = torch.ones(100, 2, dtype=torch.float64)
     values[0] = 1000
     schedule.observe(values)
@@ -260,8 +238,7 @@ def test_one_outlier_does_not_set_the_range():
 
 
 def test_an_episode_is_the_same_in_one_go_and_step_by_step():
-    network = make_network()
-    model = UFRNN(network, Foresight("foresight", make_schedule(), num_samples=3, horizon=2))
+    model = small_model(exploration="foresight")
     inputs = torch.rand(2, 6, 7, dtype=torch.float64)
     whole, traces = model(inputs, torch.Generator().manual_seed(5))
     generator = torch.Generator().manual_seed(5)

@@ -9,7 +9,7 @@ from oracle import Oracle
 from small import batch_of, make_dataset, observation, small_config, train
 
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
-from lerobot_ufrnn.rest import REST_STEPS
+from lerobot_ufrnn.recall import REST_STEPS
 
 
 def make_trained(dataset, **overrides) -> UFRNNPolicy:
@@ -93,7 +93,7 @@ def test_the_pipelines_leave_values_alone(trained, dataset):
 
 
 def test_foresight_shows_what_it_saw(dataset):
-    policy = make_trained(dataset, recall=False)
+    policy = make_trained(dataset, recall={"enabled": False})
     policy.select_action(observation(2))
     trace = policy.last_trace
     with pytest.raises(RuntimeError, match="kernel='reference'"):
@@ -104,7 +104,7 @@ def test_foresight_shows_what_it_saw(dataset):
 
 def test_the_baselines_run_in_the_same_code(dataset):
     for exploration in ("noise", "none"):
-        policy = make_trained(dataset, exploration=exploration, recall=False)
+        policy = make_trained(dataset, exploration=exploration, recall={"enabled": False})
         first, second = (policy.select_action(observation()) for _ in range(2))
         policy.reset()
         repeated = policy.select_action(observation())
@@ -115,8 +115,8 @@ def test_the_baselines_run_in_the_same_code(dataset):
 
 @pytest.mark.parametrize("exploration", ["foresight", "noise", "none"])
 def test_with_recall_a_policy_that_is_never_surprised_acts_without_noise(dataset, exploration):
-    calm = make_trained(dataset, exploration=exploration, surprise_threshold=1e30)
-    plain = make_trained(dataset, exploration="none", recall=False)
+    calm = make_trained(dataset, exploration=exploration, recall={"surprise_threshold": 1e30})
+    plain = make_trained(dataset, exploration="none", recall={"enabled": False})
     plain.load_state_dict(calm.state_dict())
     for _ in range(15):
         assert torch.equal(calm.select_action(observation()), plain.select_action(observation()))
@@ -125,7 +125,7 @@ def test_with_recall_a_policy_that_is_never_surprised_acts_without_noise(dataset
 
 
 def test_with_recall_a_surprised_policy_goes_back_until_it_is_reset(dataset):
-    policy = make_trained(dataset, surprise_threshold=1.01, recall_samples=5)
+    policy = make_trained(dataset, recall={"surprise_threshold": 1.01, "num_samples": 5})
     far = observation(1)
     far["observation.state"] += 5
     for _ in range(20):
@@ -201,7 +201,7 @@ def test_a_policy_whose_weights_are_nan_sends_nothing_to_the_robot(trained, name
 
 
 def test_training_goes_through_both_phases_and_encodes_each_frame_once(dataset, monkeypatch):
-    policy = make_policy(small_config(autoencoder_steps=3), ds_meta=dataset.meta)
+    policy = make_policy(small_config(autoencoder={"steps": 3}), ds_meta=dataset.meta)
     encoded = []
     encode = policy.image_encoder.encode
     monkeypatch.setattr(
@@ -228,7 +228,7 @@ def test_once_the_features_are_kept_the_loader_decodes_no_video(tmp_path, monkey
     monkeypatch.setattr(
         dataset_reader, "decode_video_frames", lambda *args, **kwargs: decoded.append(1) or decode(*args, **kwargs)
     )
-    policy = make_policy(small_config(autoencoder_steps=2), ds_meta=dataset.meta)
+    policy = make_policy(small_config(autoencoder={"steps": 2}), ds_meta=dataset.meta)
     loader = torch.utils.data.DataLoader(torch.utils.data.Subset(dataset, [0, 5]), batch_size=2)
     counts = []
     for _ in range(5):
@@ -247,7 +247,7 @@ def test_the_loss_falls(dataset):
 
 def test_padding_does_not_count(uneven_dataset):
     """The loss of a batch is the average over existing steps: the same as of its episodes one by one."""
-    policy = make_policy(small_config(exploration="none", stall_probability=0.0), ds_meta=uneven_dataset.meta)
+    policy = make_policy(small_config(exploration="none"), ds_meta=uneven_dataset.meta)
     train(policy, [batch_of(0, 1, 2)] * 3)
     policy.eval()
     lengths = [6, 11, 8]
@@ -270,7 +270,7 @@ def test_targets_are_the_next_sensor_values(dataset):
 
 
 def test_training_holds_the_last_moment_on(dataset):
-    policy = make_policy(small_config(hold_end_steps=3), ds_meta=dataset.meta)
+    policy = make_policy(small_config(augmentation={"hold_end_steps": 3}), ds_meta=dataset.meta)
     train(policy, [batch_of(0, 1, 2)] * 3)
     episode = policy.episodes[1]
     longer = policy.train()._sequence(episode)
@@ -300,7 +300,7 @@ def test_training_remembers_where_each_demonstration_began_and_ended_and_a_check
 
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_a_policy_goes_back_from_a_rest_unless_told_not_to(dataset, at_rest):
-    policy = make_policy(small_config(recall_at_rest=at_rest, surprise_threshold=1e9), ds_meta=dataset.meta)
+    policy = make_policy(small_config(recall={"at_rest": at_rest, "surprise_threshold": 1e9}), ds_meta=dataset.meta)
     train(policy, [batch_of(0, 1, 2)] * 3)
     line = torch.linspace(0, 5, 100).unsqueeze(1).expand(-1, 3)
     policy.rest.observe(line)  # it went far from all that follows
@@ -341,9 +341,9 @@ def test_each_episode_is_one_item_of_the_sampler(dataset, uneven_dataset):
 def test_a_resumed_training_ends_with_the_same_weights(dataset, tmp_path):
     """Stop after any update, save, load, go on: bit for bit the run that was not stopped."""
     torch.manual_seed(7)
-    whole = make_policy(small_config(autoencoder_steps=2), ds_meta=dataset.meta)
+    whole = make_policy(small_config(autoencoder={"steps": 2}), ds_meta=dataset.meta)
     torch.manual_seed(7)
-    first = make_policy(small_config(autoencoder_steps=2), ds_meta=dataset.meta)
+    first = make_policy(small_config(autoencoder={"steps": 2}), ds_meta=dataset.meta)
     batches = [batch_of(0, 1), batch_of(1, 2), batch_of(2, 0), batch_of(0, 1), batch_of(1, 2)]
     optimizers = {}
 
@@ -374,7 +374,9 @@ def test_a_resumed_training_ends_with_the_same_weights(dataset, tmp_path):
 
 
 def test_a_learned_horizon_trains_its_step_heads(dataset):
-    policy = make_policy(small_config(horizon_mode="learned", horizon=6, recall=False), ds_meta=dataset.meta)
+    policy = make_policy(
+        small_config({"horizon_mode": "learned", "horizon": 6}, recall={"enabled": False}), ds_meta=dataset.meta
+    )
     before = policy.model.network.joint_head.bias[-1].item()
     train(policy, [batch_of(0, 1, 2)] * 6)
     assert policy.model.network.joint_head.bias[-1].item() != before
@@ -384,7 +386,7 @@ def test_a_learned_horizon_trains_its_step_heads(dataset):
 
 def test_a_trained_autoencoder_can_be_given(dataset, trained, tmp_path):
     trained.save_pretrained(tmp_path)
-    policy = make_policy(small_config(autoencoder_path=str(tmp_path)), ds_meta=dataset.meta)
+    policy = make_policy(small_config(autoencoder={"path": str(tmp_path)}), ds_meta=dataset.meta)
     losses = train(policy, [batch_of(0, 1, 2)] * 2)
     assert len(losses) == 2
     for ours, theirs in zip(
@@ -490,15 +492,15 @@ def test_weights_of_another_network_are_refused(trained, dataset, tmp_path):
 
 @pytest.mark.parametrize("path", ["/nowhere/at/all", "./missing", "just_a_word"])
 def test_a_wrong_autoencoder_path_is_refused(dataset, path):
-    policy = make_policy(small_config(autoencoder_path=path), ds_meta=dataset.meta)
+    policy = make_policy(small_config(autoencoder={"path": path}), ds_meta=dataset.meta)
     policy.train()
-    with pytest.raises(ValueError, match="`autoencoder_path` must be a checkpoint folder"):
+    with pytest.raises(ValueError, match=r"`autoencoder\.path` must be a checkpoint folder"):
         policy.forward(batch_of(0))
 
 
 def test_an_autoencoder_of_another_size_is_refused(dataset, trained, tmp_path):
     trained.save_pretrained(tmp_path)
-    policy = make_policy(small_config(feature_dim=5, autoencoder_path=str(tmp_path)), ds_meta=dataset.meta)
+    policy = make_policy(small_config(autoencoder={"feature_dim": 5, "path": str(tmp_path)}), ds_meta=dataset.meta)
     policy.train()
     with pytest.raises(ValueError, match="does not fit"):
         policy.forward(batch_of(0))

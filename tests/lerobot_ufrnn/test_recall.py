@@ -6,18 +6,35 @@ import numpy as np
 import pytest
 import torch
 from oracle import Oracle
-from small_network import FEATURES, JOINTS, in_closed_loop, is_close, is_equal, row_of, small_network
+from small_network import (
+    FEATURES,
+    JOINTS,
+    in_closed_loop,
+    is_close,
+    is_equal,
+    network_config,
+    row_of,
+    small_model,
+)
 
-from lerobot_ufrnn import alternatives as alternatives_module
 from lerobot_ufrnn import recall as recall_module
-from lerobot_ufrnn.alternatives import DEVIATION_STEPS, REFUTED, SOON, Alternatives
-from lerobot_ufrnn.attempt import FIRST_STEPS, PATIENCE
-from lerobot_ufrnn.foresight import Foresight, NoiseSchedule
+from lerobot_ufrnn.foresight import UFRNN, Memory
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
 from lerobot_ufrnn.networks import HiddenState, Prediction
-from lerobot_ufrnn.recall import LONGEST_RETURN, LONGEST_TRAIL, STALLED, Recall, surprise
-from lerobot_ufrnn.recurrent import UFRNN, Memory
-from lerobot_ufrnn.rest import REST_STEPS
+from lerobot_ufrnn.recall import (
+    DEVIATION_STEPS,
+    FIRST_STEPS,
+    LONGEST_RETURN,
+    LONGEST_TRAIL,
+    PATIENCE,
+    REFUTED,
+    REST_STEPS,
+    SOON,
+    STALLED,
+    Alternatives,
+    Recall,
+    surprise,
+)
 
 # With a surprise of 6 at each step, the running surprise is 3, which is above half the threshold, and then 4.5.
 THRESHOLD, CONTRADICTION, STEPS_TO_FIRE = 4.0, 6.0, 2
@@ -27,19 +44,22 @@ UNTIL_BLOCKED = 1 + FIRST_STEPS + PATIENCE + 1
 """Steps after which an arm that does not move is known to be blocked."""
 
 
-def make_recall(kernel=UFRNN, exploration="foresight", **overrides) -> Recall:
+class NeverRests:
+    def detects(self, joints):
+        return False
+
+
+def make_recall(kernel=UFRNN, exploration="foresight", rest=None, **overrides) -> Recall:
     """Recall of a small network, whose futures are all alike unless a test asks for noise."""
-    schedule = NoiseSchedule((0.05, 0.15), "std", False)
-    model = kernel(small_network(), Foresight(exploration, schedule, 5, 3)).double()
     settings = {
-        "threshold": THRESHOLD,
+        "surprise_threshold": THRESHOLD,
         "num_samples": SAMPLES,
         "noise_range": (0.0, 0.0),
         "horizon": HORIZON,
         "commitment": COMMITMENT,
-        "memory": 200.0,
     }
-    return Recall(model, **{**settings, **overrides})
+    config = network_config(exploration=exploration, recall={**settings, **overrides})
+    return Recall(small_model(kernel, exploration=exploration), config, rest or NeverRests())
 
 
 def sensed(
@@ -173,8 +193,8 @@ def test_surprise_is_one_on_average_where_the_prediction_is_right_about_its_erro
 @pytest.mark.parametrize("kernel", [UFRNN, FastUFRNN])
 @pytest.mark.parametrize("exploration", ["foresight", "noise", "none"])
 def test_who_is_never_surprised_steps_as_a_model_without_exploration(kernel, exploration):
-    recall = make_recall(kernel, exploration, threshold=float("inf"), noise_range=(0.2, 1.5))
-    plain = kernel(recall.model.network, Foresight("none", NoiseSchedule((0.05, 0.15), "std", False), 1, 1)).double()
+    recall = make_recall(kernel, exploration, surprise_threshold=1e30, noise_range=(0.2, 1.5))
+    plain = small_model(kernel)
     memory = expected = plain.initial_memory(2)
     for inputs in torch.rand(40, 2, JOINTS + FEATURES, dtype=torch.float64):
         memory, _ = recall.advance(inputs, memory)
@@ -235,7 +255,7 @@ class StandsStill:
 
 def resting_world(**overrides) -> World:
     """Nothing surprises, but the arm stands still after `CALM_STEPS` until recall goes back."""
-    world = World(make_recall(threshold=float("inf"), rest=StandsStill(), **overrides), torch.Generator())
+    world = World(make_recall(surprise_threshold=1e30, rest=StandsStill(), **overrides), torch.Generator())
     world.steps(CALM_STEPS)
     for _ in range(REST_STEPS):
         assert not world.events
@@ -261,12 +281,12 @@ def test_a_rest_begins_anew_when_a_future_has_been_carried_out():
     assert len(world.events) == 2
 
 
-def test_without_a_detector_or_while_it_moves_there_is_no_rest():
-    for rest in (None, StandsStill()):
-        world = World(make_recall(threshold=float("inf"), rest=rest))
+def test_with_at_rest_off_or_while_it_moves_there_is_no_rest():
+    for at_rest in (False, True):
+        world = World(make_recall(surprise_threshold=1e30, rest=StandsStill(), at_rest=at_rest))
         world.steps(CALM_STEPS)
         for _ in range(3 * REST_STEPS):
-            world.step() if rest else world.stand()
+            world.step() if at_rest else world.stand()
         assert not world.events
 
 
@@ -452,7 +472,7 @@ def likeness(event, failures: list[np.ndarray], here: np.ndarray) -> list[np.nda
 
 
 def test_what_was_being_done_is_refuted_and_so_is_what_is_blocked_while_both_fade(monkeypatch):
-    monkeypatch.setattr(alternatives_module, "SAME_FUTURE", NARROW)  # this network's futures are much alike
+    monkeypatch.setattr(recall_module, "SAME_FUTURE", NARROW)  # this network's futures are much alike
     world = surprised_world(noise_range=(1.0, 2.5), num_samples=41, memory=30.0)
     world.is_blocked()
     oracle = Oracle(world.network)
@@ -568,7 +588,7 @@ def test_a_try_that_succeeded_is_not_refuted(monkeypatch):
 
 def test_each_episode_of_a_batch_is_on_its_own():
     """The second goes back twice; the first never does and stays what it is alone, bit for bit."""
-    recall, plain = make_recall(FastUFRNN), make_recall(FastUFRNN).model
+    recall, plain = make_recall(FastUFRNN), small_model(FastUFRNN)
     memory, expected = recall.model.initial_memory(2), plain.initial_memory(1)
     generator = torch.Generator().manual_seed(0)
     first, second = (World(make_recall(FastUFRNN), torch.Generator().manual_seed(0)) for _ in range(2))

@@ -6,8 +6,8 @@ import socket
 import threading
 import time
 
-from .configuration_ur5e_robotiq import UR5eRobotiqConfig
-from .errors import Fault, RobotFaultError
+from .configuration import UR5eRobotiqConfig
+from .faults import Fault, RobotFaultError
 
 logger = logging.getLogger(__name__)
 
@@ -18,8 +18,16 @@ ACTIVATION_SECONDS = 15.0
 """Seconds that activating may take: it opens and closes once."""
 
 POLL_SECONDS = 0.05
+"""Pause between two questions; the socket takes tens of milliseconds for each anyway."""
+
 ACTIVE = 3
+"""Its status once it is activated."""
+
 FULL = 255
+"""Full speed and full force."""
+
+FIRST_FAULT = 8
+"""Fault codes below this one only say that a move waits for activation."""
 
 
 def closure_at(reading: int, gripper_range: tuple[int, int]) -> float:
@@ -28,14 +36,10 @@ def closure_at(reading: int, gripper_range: tuple[int, int]) -> float:
     return min(max((reading - opened) / (closed - opened), 0.0), 1.0)
 
 
-class Gripper:
+class RobotiqGripper:
     """Follows a target and knows where it is; a thread of its own does the asking.
 
     The socket takes tens of milliseconds to answer, too long for a control loop to wait for.
-
-    Args:
-        config (`UR5eRobotiqConfig`):
-            Address, force, speed and range.
     """
 
     def __init__(self, config: UR5eRobotiqConfig):
@@ -50,8 +54,7 @@ class Gripper:
     def connect(self) -> None:
         """Connects and, if it is not active yet, activates the gripper, which then opens and closes once.
 
-        Raises:
-            RobotFaultError: If it does not answer, or has a fault.
+        Raises a `RobotFaultError` if it does not answer, or has a fault.
         """
         config = self._config
         try:
@@ -87,25 +90,13 @@ class Gripper:
 
     @property
     def closure(self) -> float:
-        """`float`: measured closure from 0, open, to 1, closed.
-
-        Raises:
-            RobotFaultError: If the gripper does not answer, or has a fault.
-        """
+        """`float`: measured, from 0, open, to 1, closed; raises a `RobotFaultError` on a silent or faulty gripper."""
         if self._fault is not None:
             raise self._fault
         return closure_at(self._position, self._config.gripper_range)
 
     def move_to(self, closure: float) -> None:
-        """Sets the target.
-
-        Args:
-            closure (`float`):
-                From 0, open, to 1, closed.
-
-        Raises:
-            RobotFaultError: If the gripper does not answer, or has a fault.
-        """
+        """Sets the target from 0, open, to 1, closed; raises as `closure` does."""
         if self._fault is not None:
             raise self._fault
         opened, closed = self._config.gripper_range
@@ -139,8 +130,7 @@ class Gripper:
             time.sleep(POLL_SECONDS)
 
     def _check_fault(self) -> None:
-        # Below 8 it only says that a move waits for activation.
-        if (fault := self._get("FLT")) >= 8:
+        if (fault := self._get("FLT")) >= FIRST_FAULT:
             raise RobotFaultError(Fault.GRIPPER_FAULT, f"the gripper reports fault {fault}")
 
     def _get(self, name: str) -> int:

@@ -5,9 +5,10 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from .configuration_ur5e_robotiq import FEATURES, UR5eRobotiqConfig
+from .configuration import FEATURES, UR5eRobotiqConfig
 
-# Nominal kinematics of the UR5e as its maker publishes them (modified by a few 0.1 mm on each real arm).
+# Denavit-Hartenberg parameters of the UR5e as its maker publishes them, in m and rad (a real arm's differ by some
+# 0.1 mm). The limits must not depend on the simulator, whose kinematics a test compares them with.
 LINK_OFFSETS = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
 LINK_LENGTHS = (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0)
 LINK_TWISTS = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
@@ -17,15 +18,7 @@ HALVINGS = 6
 
 
 def flange_position(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Position of the flange from the Denavit-Hartenberg parameters.
-
-    Args:
-        joints (`NDArray[np.float64]`):
-            Joint angles in rad, (6,).
-
-    Returns:
-        `NDArray[np.float64]`: position in m in the frame of the arm's base, (3,).
-    """
+    """Position of the flange in m, in the frame of the arm's base, (3,), at joint angles in rad, (6,)."""
     pose = np.eye(4)
     for angle, offset, length, twist in zip(joints, LINK_OFFSETS, LINK_LENGTHS, LINK_TWISTS, strict=True):
         cos, sin, cos_twist, sin_twist = np.cos(angle), np.sin(angle), np.cos(twist), np.sin(twist)
@@ -45,10 +38,6 @@ class Limits:
 
     A target is limited, in this order, to the joint ranges, to the joint speed, to a distance from the measured joints
     and to the workspace. What is no target at all (a wrong number of values, a value that is not finite) is refused.
-
-    Args:
-        config (`UR5eRobotiqConfig`):
-            The limits.
     """
 
     def __init__(self, config: UR5eRobotiqConfig):
@@ -58,17 +47,9 @@ class Limits:
         self._box_low, self._box_high = np.array(config.workspace_low), np.array(config.workspace_high)
 
     def check(self, action: dict[str, float]) -> tuple[NDArray[np.float64], float]:
-        """Reads an action and refuses what is none.
+        """Joint targets in rad, (6,), and the gripper's from 0 to 1.
 
-        Args:
-            action (`dict[str, float]`):
-                `<joint>.pos` of every joint in rad and `gripper.pos`.
-
-        Returns:
-            `tuple[NDArray[np.float64], float]`: joint targets (6,), and the gripper's from 0 to 1.
-
-        Raises:
-            ValueError: If a value is missing, unknown or not finite.
+        Raises a `ValueError` if a value is missing, unknown or not finite.
         """
         if set(action) != set(FEATURES):
             raise ValueError(
@@ -84,19 +65,7 @@ class Limits:
     def limit(
         self, target: NDArray[np.float64], commanded: NDArray[np.float64], measured: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The target that may be sent.
-
-        Args:
-            target (`NDArray[np.float64]`):
-                Joint angles that are asked for, in rad, (6,).
-            commanded (`NDArray[np.float64]`):
-                Those that were last sent, (6,).
-            measured (`NDArray[np.float64]`):
-                Those that the arm has, (6,).
-
-        Returns:
-            `NDArray[np.float64]`: joint angles, (6,).
-        """
+        """The target that may be sent: joint angles in rad, (6,), as are what is asked for, last sent and measured."""
         target = np.clip(target, self._low, self._high)
         target = np.clip(target, commanded - self._max_change, commanded + self._max_change)
         target = np.clip(target, measured - self._command_limit, measured + self._command_limit)

@@ -11,15 +11,15 @@ import signal
 import sys
 import time
 import traceback
+from dataclasses import dataclass
+from multiprocessing.context import BaseContext
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .client import import_client
-from .configuration_ur5e_robotiq import UR5eRobotiqConfig
-from .errors import Fault, RobotFaultError
-from .mailbox import Mailbox
+from .configuration import UR5eRobotiqConfig
+from .faults import Fault, RobotFaultError
 
 START_SECONDS = 60.0
 """How long connecting may take; the client uploads a program and waits for it to run."""
@@ -30,12 +30,16 @@ STOP_DECELERATION = 4.0
 SETTLE_SECONDS = 0.1
 """How long the values that tell of one cause may take to come in."""
 
+SILENT_SECONDS = 0.5
+"""How much longer than `stale_after` nothing may be heard of the servo process; it tells of faults within that time."""
+
+STOP_SECONDS = 5.0
+"""How long the servo process may take to end by itself; by then the controller's watchdog has stopped the arm."""
+
+# Modes as the controller numbers them.
 ROBOT_MODE_RUNNING = 7
 SAFETY_NORMAL, SAFETY_REDUCED = 1, 2
 STOPPED_BY_SAFETY = {3: Fault.PROTECTIVE_STOP, 6: Fault.EMERGENCY_STOP, 7: Fault.EMERGENCY_STOP}
-
-SILENT_SECONDS = 0.5
-"""How much longer than `stale_after` nothing may be heard of the servo process; it tells of faults within that time."""
 
 # What the servo tells; the moment is that of `time.monotonic()`, which all processes have in common.
 MEASURED, COMMANDED, FAULT, MOMENT = slice(0, 6), slice(6, 12), 12, 13
@@ -43,37 +47,86 @@ STATE_SIZE = 14
 TEXT_SIZE = 400
 
 
-class Servo:
-    """The servo process as its owner sees it.
+def import_client(what: str = "--robot.type=ur5e_robotiq") -> tuple[Any, Any, Any]:
+    """The controller's client library, needed by `what`: `rtde_control`, `rtde_receive` and `dashboard_client`."""
+    try:
+        import dashboard_client
+        import rtde_control
+        import rtde_receive
+    except ImportError as error:
+        raise ImportError(
+            f"{what} needs ur_rtde, which cannot be imported ({error}): `pip install 'lerobot_policy_ufrnn[ur5e]'`. "
+            "Everything else works without it."
+        ) from error
+    return rtde_control, rtde_receive, dashboard_client
 
-    Args:
-        config (`UR5eRobotiqConfig`):
-            Address, rates and limits.
+
+class Mailbox:
+    """The latest of a series of vectors of `size` numbers, from one process to another, without a lock to die in.
+
+    The writer fills one of two slots while the other holds the last whole vector, then counts up, which is what makes
+    the new one the latest. So a writer that is stopped or killed half-way leaves neither a lock nor a broken vector
+    behind, and the reader never waits for it.
     """
+
+    def __init__(self, context: BaseContext, size: int):
+        self._shared: Any = context.RawArray("d", 1 + 2 * size)
+
+    def write(self, values: NDArray[np.float64]) -> None:
+        """Replaces the vector."""
+        count, slots = self._parts()
+        number = int(count[0]) + 1
+        slots[number % 2] = values
+        count[0] = number
+
+    def read(self) -> tuple[int, NDArray[np.float64]]:
+        """How many vectors were written so far, and the latest; zeros before the first."""
+        count, slots = self._parts()
+        while True:
+            number = int(count[0])
+            values = slots[number % 2].copy()
+            # Unless one more was written meanwhile, the writer was busy with the other slot at most.
+            if count[0] == number:
+                return number, values
+
+    def _parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        numbers = np.frombuffer(self._shared)
+        return numbers[:1], numbers[1:].reshape(2, -1)
+
+
+@dataclass
+class _Shared:
+    """What the servo process and its owner have in common."""
+
+    targets: Mailbox
+    state: Mailbox
+    text: Any
+    stop: Any
+    ready: Any
+
+
+class Servo:
+    """The servo process as its owner sees it."""
 
     def __init__(self, config: UR5eRobotiqConfig):
         self._config = config
         context = multiprocessing.get_context("spawn")
-        self._targets, self._state = Mailbox(context, 6), Mailbox(context, STATE_SIZE)
-        self._text: Any = context.RawArray("c", TEXT_SIZE)
-        self._stop = context.Event()
-        self._ready = context.Event()
+        self._shared = _Shared(
+            targets=Mailbox(context, 6),
+            state=Mailbox(context, STATE_SIZE),
+            text=context.RawArray("c", TEXT_SIZE),
+            stop=context.Event(),
+            ready=context.Event(),
+        )
         self._process = context.Process(
-            target=_run,
-            args=(config, os.getpid(), self._targets, self._state, self._text, self._stop, self._ready),
-            name="ur5e-servo",
-            daemon=True,
+            target=_run, args=(config, os.getpid(), self._shared), name="ur5e-servo", daemon=True
         )
 
     def start(self) -> None:
-        """Connects and holds the arm where it is.
-
-        Raises:
-            RobotFaultError: If that fails.
-        """
+        """Connects and holds the arm where it is, or raises a `RobotFaultError`."""
         self._process.start()
         deadline = time.monotonic() + START_SECONDS
-        while not self._ready.wait(0.05):
+        while not self._shared.ready.wait(0.05):
             if not self._process.is_alive() or time.monotonic() > deadline:
                 fault = self.fault
                 self.stop()
@@ -83,64 +136,46 @@ class Servo:
 
     def stop(self) -> None:
         """Decelerates the arm, ends the program on the controller and the process. Safe to call at any time."""
-        self._stop.set()
+        self._shared.stop.set()
         if self._process.pid is not None:
-            self._process.join(timeout=5.0)
+            self._process.join(STOP_SECONDS)
             if self._process.is_alive():
-                # The controller's watchdog has stopped the arm by now.
                 self._process.kill()
                 self._process.join(timeout=1.0)
 
     @property
     def fault(self) -> RobotFaultError | None:
         """`RobotFaultError | None`: why the arm was stopped, if it was."""
-        _, values = self._state.read()
+        _, values = self._shared.state.read()
         fault = Fault(int(values[FAULT]))
         if fault is not Fault.NONE:
-            return RobotFaultError(fault, self._text.value.decode(errors="replace") or "no details")
-        if self._process.pid is None or self._stop.is_set():
+            return RobotFaultError(fault, self._shared.text.value.decode(errors="replace") or "no details")
+        if self._process.pid is None or self._shared.stop.is_set():
             return None
         if not self._process.is_alive():
             return RobotFaultError(Fault.SERVO_DIED, f"exit code {self._process.exitcode}")
         silent = time.monotonic() - values[MOMENT]
-        if self._ready.is_set() and silent > self._config.stale_after + SILENT_SECONDS:
+        if self._shared.ready.is_set() and silent > self._config.stale_after + SILENT_SECONDS:
             return RobotFaultError(Fault.SERVO_LATE, f"the servo process hangs: nothing heard of it for {silent:.1f} s")
         return None
 
-    def check(self) -> None:
-        """Says so if the arm was stopped.
-
-        Raises:
-            RobotFaultError: If it was.
-        """
-        if (fault := self.fault) is not None:
-            raise fault
-
     def read(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where the arm is.
-
-        Returns:
-            `tuple[NDArray[np.float64], NDArray[np.float64]]`: measured and commanded joints in rad, (6,) each.
-
-        Raises:
-            RobotFaultError: If the arm was stopped.
-        """
-        self.check()
-        _, values = self._state.read()
+        """Measured and commanded joints in rad, (6,) each; raises a `RobotFaultError` if the arm was stopped."""
+        self._check()
+        _, values = self._shared.state.read()
         return values[MEASURED], values[COMMANDED]
 
     def move_to(self, target: NDArray[np.float64]) -> None:
-        """Sets the target that the arm is to be at one control period from now.
+        """Sets the target, in rad and within all limits, (6,), that the arm is to be at one control period from now.
 
-        Args:
-            target (`NDArray[np.float64]`):
-                Joint angles in rad within all limits, (6,).
-
-        Raises:
-            RobotFaultError: If the arm was stopped.
+        Raises a `RobotFaultError` if the arm was stopped.
         """
-        self.check()
-        self._targets.write(target)
+        self._check()
+        self._shared.targets.write(target)
+
+    def _check(self) -> None:
+        if (fault := self.fault) is not None:
+            raise fault
 
 
 class _StopError(Exception):
@@ -148,147 +183,139 @@ class _StopError(Exception):
         self.fault, self.detail = fault, detail
 
 
-def _run(
-    config: UR5eRobotiqConfig,
-    owner: int,
-    targets: Mailbox,
-    state: Mailbox,
-    text: Any,
-    stop: Any,
-    ready: Any,
-) -> None:
+def _run(config: UR5eRobotiqConfig, owner: int, shared: _Shared) -> None:
     """The servo process."""
     # Ctrl-C reaches every process of a terminal; what becomes of the arm is its owner's decision.
     for name in ("SIGINT", "SIGHUP"):  # so does a terminal that is closed, where there is such a signal
         if (number := getattr(signal, name, None)) is not None:
             signal.signal(number, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    values, control, link_works = np.zeros(STATE_SIZE), None, True
+    signal.signal(signal.SIGTERM, lambda *_: shared.stop.set())
+    driver, link_works = _Driver(config, owner, shared), True
     try:
-        control, receive = _connect(config)
-        _servo(config, owner, control, receive, targets, state, stop, ready, values)
+        driver.connect()
+        driver.drive()
     except _StopError as stopped:
-        _tell(state, text, values, stopped.fault, stopped.detail)
+        driver.tell(stopped.fault, stopped.detail)
         link_works = stopped.fault not in (Fault.LINK_LOST, Fault.STALE_DATA)
     except Exception as error:
         traceback.print_exc()
-        _tell(state, text, values, Fault.SERVO_DIED, f"{type(error).__name__}: {error}")
+        driver.tell(Fault.SERVO_DIED, f"{type(error).__name__}: {error}")
     if link_works:
-        _halt(control)
+        driver.halt()
     # Over a broken link the client waits for minutes, reconnects by itself or aborts when it is destroyed. The watchdog
     # has stopped the arm, so the process ends here and now.
     sys.stderr.flush()
     os._exit(0)
 
 
-def _tell(state: Mailbox, text: Any, values: NDArray[np.float64], fault: Fault, detail: str) -> None:
-    text.value = detail.encode()[: TEXT_SIZE - 1]
-    values[FAULT] = fault
-    state.write(values)
+class _Driver:
+    """What the servo process does."""
 
+    def __init__(self, config: UR5eRobotiqConfig, owner: int, shared: _Shared):
+        self._config, self._owner, self._shared = config, owner, shared
+        self._values = np.zeros(STATE_SIZE)
+        self._control: Any = None
+        self._receive: Any = None
 
-def _connect(config: UR5eRobotiqConfig) -> tuple[Any, Any]:
-    rtde_control, rtde_receive, _ = import_client()
-    try:
-        receive = rtde_receive.RTDEReceiveInterface(config.ip, config.servo_frequency)
-        control = rtde_control.RTDEControlInterface(config.ip, config.servo_frequency)
-    except RuntimeError as error:
-        raise _StopError(Fault.LINK_LOST, f"cannot connect to {config.ip}: {error}") from error
-    if not control.setWatchdog(config.watchdog_frequency):
-        _halt(control)
-        raise _StopError(Fault.COMMAND_REFUSED, "the controller's watchdog could not be armed")
-    return control, receive
-
-
-def _halt(control: Any) -> None:
-    """Stops the arm and ends the program on the controller, as far as the link still carries that."""
-    if control is None:
-        return
-    for command in (lambda: control.servoStop(STOP_DECELERATION), control.stopScript, control.disconnect):
-        with contextlib.suppress(Exception):
-            if control.isConnected():
-                command()
-
-
-def _servo(
-    config: UR5eRobotiqConfig,
-    owner: int,
-    control: Any,
-    receive: Any,
-    targets: Mailbox,
-    state: Mailbox,
-    stop: Any,
-    ready: Any,
-    values: NDArray[np.float64],
-) -> None:
-    period = 1.0 / config.servo_frequency
-    commanded = np.array(receive.getActualQ())
-    begin = end = commanded
-    began, seen = time.monotonic(), targets.read()[0]
-    stamp, stamped = receive.getTimestamp(), time.monotonic()
-    due = time.monotonic()
-    while not stop.is_set():
-        now = time.monotonic()
-        if (newest := receive.getTimestamp()) != stamp:
-            stamp, stamped = newest, now
-        _check(config, owner, control, receive, now, stamped)
-        count, target = targets.read()
-        if count != seen:
-            seen, begin, end, began = count, commanded, target, now
-        progress = min((now - began) / config.control_period, 1.0)
-        measured = np.array(receive.getActualQ())
-        wanted = begin + (end - begin) * progress
-        # A blocked arm must not be leant against harder than agreed, however far it is pushed back between targets.
-        commanded = np.clip(wanted, measured - config.command_limit, measured + config.command_limit)
+    def connect(self) -> None:
+        """Connects to the controller and arms its watchdog."""
+        config = self._config
+        rtde_control, rtde_receive, _ = import_client()
         try:
-            taken = control.servoJ(commanded.tolist(), 0.0, 0.0, period, config.servo_lookahead, config.servo_gain)
-        except RuntimeError as error:  # the client found the link broken and tried in vain to mend it
-            raise _StopError(Fault.LINK_LOST, str(error)) from error
-        if not taken:
+            self._receive = rtde_receive.RTDEReceiveInterface(config.ip, config.servo_frequency)
+            self._control = rtde_control.RTDEControlInterface(config.ip, config.servo_frequency)
+        except RuntimeError as error:
+            raise _StopError(Fault.LINK_LOST, f"cannot connect to {config.ip}: {error}") from error
+        if not self._control.setWatchdog(config.watchdog_frequency):
+            raise _StopError(Fault.COMMAND_REFUSED, "the controller's watchdog could not be armed")
+
+    def drive(self) -> None:
+        """Sends set-points, on a straight line from target to target, until the owner ends it or something is wrong."""
+        config, shared, values = self._config, self._shared, self._values
+        control, receive = self._control, self._receive
+        period = 1.0 / config.servo_frequency
+        commanded = np.array(receive.getActualQ())
+        begin = end = commanded
+        began, seen = time.monotonic(), shared.targets.read()[0]
+        stamp, stamped = receive.getTimestamp(), time.monotonic()
+        due = time.monotonic()
+        while not shared.stop.is_set():
+            now = time.monotonic()
+            if (newest := receive.getTimestamp()) != stamp:
+                stamp, stamped = newest, now
+            self._check(now, stamped)
+            count, target = shared.targets.read()
+            if count != seen:
+                seen, begin, end, began = count, commanded, target, now
+            progress = min((now - began) / config.control_period, 1.0)
+            measured = np.array(receive.getActualQ())
+            wanted = begin + (end - begin) * progress
+            # A blocked arm must not be leant against harder than agreed, however far it is pushed back between targets.
+            commanded = np.clip(wanted, measured - config.command_limit, measured + config.command_limit)
+            try:
+                # The controller ignores speed and acceleration here.
+                taken = control.servoJ(commanded.tolist(), 0.0, 0.0, period, config.servo_lookahead, config.servo_gain)
+            except RuntimeError as error:  # the client found the link broken and tried in vain to mend it
+                raise _StopError(Fault.LINK_LOST, str(error)) from error
+            if not taken:
+                time.sleep(SETTLE_SECONDS)
+                self._check(now, stamped)
+                raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
+            # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
+            values[MEASURED], values[COMMANDED], values[MOMENT] = measured, commanded, time.monotonic()
+            shared.state.write(values)
+            shared.ready.set()
+            due += period
+            if (behind := time.monotonic() - due) > 0:
+                if behind > config.stale_after:
+                    raise _StopError(Fault.SERVO_LATE, f"a set-point came {1000 * behind:.0f} ms late")
+                due = time.monotonic()
+            else:
+                time.sleep(-behind)
+        # The owner may have asked for the end because of what the same cause did to the gripper or a camera.
+        self._check_interruption()
+
+    def tell(self, fault: Fault, detail: str) -> None:
+        """Lets the owner know why the arm was stopped."""
+        self._shared.text.value = detail.encode()[: TEXT_SIZE - 1]
+        self._values[FAULT] = fault
+        self._shared.state.write(self._values)
+
+    def halt(self) -> None:
+        """Stops the arm and ends the program on the controller, as far as the link still carries that."""
+        control = self._control
+        if control is None:
+            return
+        for command in (lambda: control.servoStop(STOP_DECELERATION), control.stopScript, control.disconnect):
+            with contextlib.suppress(Exception):
+                if control.isConnected():
+                    command()
+
+    def _check(self, now: float, stamped: float) -> None:
+        """Looks for a reason to stop."""
+        if not (self._receive.isConnected() and self._control.isConnected()):
+            raise _StopError(Fault.LINK_LOST, f"the connection to {self._config.ip} broke")
+        if now - stamped > self._config.stale_after:
+            silent = f"no new data from {self._config.ip} for {1000 * (now - stamped):.0f} ms"
+            raise _StopError(Fault.STALE_DATA, silent)
+        self._check_interruption()
+        if os.getppid() != self._owner:
+            raise _StopError(Fault.OWNER_GONE, "the program that commanded it ended")
+
+    def _check_interruption(self) -> None:
+        if self._interruption() is not None:
+            # One cause shows in several values, which come one after the other and over two connections: nothing more
+            # is commanded while the rest comes in, then the most telling one counts.
             time.sleep(SETTLE_SECONDS)
-            _check(config, owner, control, receive, now, stamped)
-            raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
-        # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
-        values[MEASURED], values[COMMANDED], values[MOMENT] = measured, commanded, time.monotonic()
-        state.write(values)
-        ready.set()
-        due += period
-        if (behind := time.monotonic() - due) > 0:
-            if behind > config.stale_after:
-                raise _StopError(Fault.SERVO_LATE, f"a set-point came {1000 * behind:.0f} ms late")
-            due = time.monotonic()
-        else:
-            time.sleep(-behind)
-    # The owner may have asked for the end because of what the same cause did to the gripper or a camera.
-    _check_interruption(control, receive)
+            paused = _StopError(Fault.PROGRAM_STOPPED, "the controller paused the program")
+            raise self._interruption() or paused
 
-
-def _check(config: UR5eRobotiqConfig, owner: int, control: Any, receive: Any, now: float, stamped: float) -> None:
-    """Looks for a reason to stop."""
-    if not (receive.isConnected() and control.isConnected()):
-        raise _StopError(Fault.LINK_LOST, f"the connection to {config.ip} broke")
-    if now - stamped > config.stale_after:
-        raise _StopError(Fault.STALE_DATA, f"no new data from {config.ip} for {1000 * (now - stamped):.0f} ms")
-    _check_interruption(control, receive)
-    if os.getppid() != owner:
-        raise _StopError(Fault.OWNER_GONE, "the program that commanded it ended")
-
-
-def _check_interruption(control: Any, receive: Any) -> None:
-    """Looks whether the controller carries out commands."""
-    if _interruption(control, receive) is not None:
-        # One cause shows in several values, which come one after the other and over two connections: nothing more is
-        # commanded while the rest comes in, then the most telling one counts.
-        time.sleep(SETTLE_SECONDS)
-        raise _interruption(control, receive) or _StopError(Fault.PROGRAM_STOPPED, "the controller paused the program")
-
-
-def _interruption(control: Any, receive: Any) -> _StopError | None:
-    """Why the controller does not carry out commands, if it says so; the most telling reason first."""
-    if (safety := receive.getSafetyMode()) not in (SAFETY_NORMAL, SAFETY_REDUCED):
-        return _StopError(STOPPED_BY_SAFETY.get(safety, Fault.PROTECTIVE_STOP), f"safety mode {safety}")
-    if (mode := receive.getRobotMode()) != ROBOT_MODE_RUNNING:
-        return _StopError(Fault.NOT_RUNNING, f"robot mode {mode} instead of {ROBOT_MODE_RUNNING} (running)")
-    if not control.isProgramRunning():
-        return _StopError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
-    return None
+    def _interruption(self) -> _StopError | None:
+        """Why the controller does not carry out commands, if it says so; the most telling reason first."""
+        if (safety := self._receive.getSafetyMode()) not in (SAFETY_NORMAL, SAFETY_REDUCED):
+            return _StopError(STOPPED_BY_SAFETY.get(safety, Fault.PROTECTIVE_STOP), f"safety mode {safety}")
+        if (mode := self._receive.getRobotMode()) != ROBOT_MODE_RUNNING:
+            return _StopError(Fault.NOT_RUNNING, f"robot mode {mode} instead of {ROBOT_MODE_RUNNING} (running)")
+        if not self._control.isProgramRunning():
+            return _StopError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
+        return None

@@ -1,0 +1,180 @@
+"""What the experiments on the robot's digital twin share: LeRobot's own commands, run beside the experiment."""
+
+import itertools
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from draccus.utils import ParsingError
+from numpy.typing import NDArray
+
+from env_door.twin import ports
+from lerobot_ufrnn.commands.flags import parse_flags
+
+FPS = 10  # control frequency in Hz, of simulation, robot and policies
+END_SECONDS = 30.0  # how long a command may take to end after an interrupt
+POLL_SECONDS = 0.02
+
+
+def run[Config](main: Callable[[Config], None], config_class: type[Config]) -> None:
+    """Runs a script with the flags of its command line; what is wrong is said without a traceback."""
+    name = Path(sys.argv[0]).name
+    try:
+        main(parse_flags(config_class, sys.argv[1:], f"python experiments/{name}"))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (ValueError, OSError, RuntimeError, ParsingError) as error:
+        sys.exit(f"{name}: {error}")
+
+
+def robot_flags(address: str) -> list[str]:
+    """The flags with which LeRobot's commands use the twin at an address as their robot."""
+    # LeRobot waits 2 s for the thread that reads the camera; one that waits longer for a picture can block the end.
+    camera = f"{{type: zmq, server_address: {address}, port: {ports.CAMERA}, camera_name: front, timeout_ms: 1000"
+    return [
+        "--robot.type=ur5e_robotiq",
+        "--robot.id=twin",
+        f"--robot.ip={address}",
+        f"--robot.cameras={{front: {camera}, width: 640, height: 480, fps: 30}}}}",
+    ]
+
+
+def record_flags(address: str, events: Path, repo_id: str, root: Path, seconds: float, episodes: int) -> list[str]:
+    """The flags with which `lerobot-record` records the twin while the events of a SpaceMouse are played."""
+    return [
+        *robot_flags(address),
+        "--teleop.type=spacemouse_twist",
+        f"--teleop.robot_ip={address}",
+        f"--teleop.device={events}",
+        f"--dataset.repo_id={repo_id}",
+        f"--dataset.root={root}",
+        f"--dataset.fps={FPS}",
+        f"--dataset.episode_time_s={seconds:g}",
+        f"--dataset.num_episodes={episodes}",
+        "--dataset.push_to_hub=false",
+        "--play_sounds=false",
+    ]
+
+
+@dataclass(frozen=True)
+class Event:
+    """A state of an input device and for how long it lasts."""
+
+    seconds: float
+    twist: NDArray[np.float64]  # (6,) deflections in -1 to 1
+    buttons: tuple[str, ...] = ()
+
+
+def write_events(events: Sequence[Event], file: Path) -> None:
+    """Writes events as a file that `--teleop.device` plays."""
+    times = itertools.accumulate((event.seconds for event in events), initial=0.0)
+    # A device is at rest after its last event, whatever that one says.
+    lines = [
+        {"time": round(moment, 4), "twist": event.twist.tolist(), "buttons": event.buttons}
+        for moment, event in zip(times, (*events, Event(0.0, np.zeros(6))), strict=True)
+    ]
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+
+
+class StockCommand:
+    """A command of LeRobot, run by this interpreter for as long as a `with` block, or ended before.
+
+    Args:
+        name (`str`): Such as `lerobot-rollout`.
+        *flags (`str`): Its flags.
+        **environment (`str`): Variables that it sees besides ours.
+    """
+
+    def __init__(self, name: str, *flags: str, **environment: str):
+        self._name, self._environment = name, environment
+        self._arguments = ["-m", f"lerobot.scripts.{name.replace('-', '_')}", *flags]
+
+    def __enter__(self) -> "StockCommand":
+        self._output = tempfile.TemporaryFile()
+        self.process = subprocess.Popen(
+            [sys.executable, *self._arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **self._environment},
+            start_new_session=True,  # Ctrl-C reaches our process alone, which then ends it in order
+            preexec_fn=_heed_signals,
+        )
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.stop()
+        self._output.close()
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it runs no more."""
+        return self.process.poll() is not None
+
+    def output(self) -> str:
+        """What it has printed so far."""
+        self._output.seek(0)
+        return self._output.read().decode(errors="replace")
+
+    def stop(self) -> None:
+        """Interrupts it, as LeRobot wants to be ended early, and waits for its end; kills it if it takes too long."""
+        if not self.has_ended:
+            self.process.send_signal(signal.SIGINT)
+        try:
+            self.process.wait(END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    def wait_for(self, text: str, seconds: float) -> None:
+        """Waits until it has printed something.
+
+        Raises:
+            RuntimeError: If it ends without printing it, or takes longer; the message has the end of its output.
+        """
+        deadline = time.monotonic() + seconds
+        while text not in self.output():
+            if self.has_ended and text not in self.output():
+                what = f"ended with status {self.process.returncode} before it printed {text!r}"
+            elif time.monotonic() > deadline:
+                what = f"did not print {text!r} within {seconds:g} s"
+            else:
+                time.sleep(POLL_SECONDS)
+                continue
+            raise RuntimeError(f"{self._name} {what}:\n{self.output()[-2000:]}")
+
+
+def _heed_signals() -> None:
+    # A background job of a shell script ignores SIGINT, one under `nohup` SIGHUP, and what it starts inherits that.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
+def late_ticks(output: str) -> int:
+    """How often a control loop of LeRobot warned that it is late."""
+    return output.count("running slower")
+
+
+def last_error(output: str) -> str:
+    """The last thing that a command told its user about its end, without what to do about it.
+
+    An error with its name, or what asked the command to end; empty if there is neither.
+    """
+    errors = re.findall(
+        r"^(?:\w+\.)*(\w+(?:Error|Exception|Interrupt)\b.*)|(Ending, as asked for by \w+)", output, re.M
+    )
+    return "".join(errors[-1]).split(". To go on:")[0].strip() if errors else ""
+
+
+def describe_failure(status: int | None, output: str) -> str:
+    """Exit status and error of a command that failed; its last line if it printed no error."""
+    return f"status {status}: {last_error(output) or output.strip().rpartition('\n')[2] or 'it printed nothing'}"

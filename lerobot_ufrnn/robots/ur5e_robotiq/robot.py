@@ -1,0 +1,327 @@
+"""UR5e with a Robotiq 2F-85 as a LeRobot robot."""
+
+import contextlib
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from types import FrameType
+from typing import Any
+
+import cv2
+import numpy as np
+from lerobot.cameras import make_cameras_from_configs
+from lerobot.lerobot_types import RobotAction, RobotObservation
+from lerobot.robots import Robot
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
+from numpy.typing import NDArray
+
+from .configuration import FEATURES, UR5eRobotiqConfig
+from .faults import Fault, RobotFaultError
+from .gripper import RobotiqGripper
+from .limits import Limits
+from .servo import Servo, import_client
+
+logger = logging.getLogger(__name__)
+
+MAX_IMAGE_AGE_MS = 500
+"""Age in ms from which an image shows something else than the measured joints."""
+
+DARK = 4.0
+"""Mean of an image, of 255, below which it shows nothing."""
+
+WRONG_SECONDS = 1.0
+"""For how long an image must be wrong; a camera may lose a frame or adjust itself."""
+
+MOVED = 0.05
+"""Distance in rad, of any joint, that cannot leave an image of the arm the same to the last bit."""
+
+ENDING_SIGNALS = ("SIGTERM", "SIGHUP")
+"""`kill`, the end of a service, a terminal or connection that is closed. Not all systems have both."""
+
+
+class UR5eRobotiq(Robot):
+    """A UR5e that is commanded joint targets at a few hertz and moves smoothly between them.
+
+    Whatever goes wrong (lost link, stale data, protective or emergency stop, stopped program, gripper fault, missing
+    camera) stops the arm; `get_observation` and `send_action` then raise [`RobotFaultError`] until somebody has looked
+    and connects again. While it is connected, SIGTERM and SIGHUP end the program in order: see [`OrderlyEnd`].
+
+    Args:
+        config (`UR5eRobotiqConfig`):
+            Addresses, rates and limits.
+    """
+
+    config_class = UR5eRobotiqConfig
+    name = "ur5e_robotiq"
+
+    def __init__(self, config: UR5eRobotiqConfig):
+        super().__init__(config)
+        self.config = config
+        self.cameras = make_cameras_from_configs(config.cameras)
+        self._limits = Limits(config)
+        self._servo: Servo | None = None
+        self._gripper: RobotiqGripper | None = None
+        self._pictures: dict[str, PictureCheck] = {}
+        self._fault: RobotFaultError | None = None
+        self._warned = False
+        self._orderly_end = OrderlyEnd()
+
+    @cached_property
+    def observation_features(self) -> dict[str, Any]:
+        """`dict`: `<joint>.pos` and `gripper.pos` as `float`, and each camera's image shape."""
+        size = self.config.image_size
+        images = {
+            name: (size, size, 3) if size else (camera.height, camera.width, 3) for name, camera in self.cameras.items()
+        }
+        return {**self.action_features, **images}
+
+    @cached_property
+    def action_features(self) -> dict[str, type]:
+        """`dict`: `<joint>.pos` in rad and `gripper.pos` from 0 to 1."""
+        return dict.fromkeys(FEATURES, float)
+
+    @property
+    def is_connected(self) -> bool:
+        """`bool`: whether it holds connections, those of a stopped arm included."""
+        return self._servo is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """`bool`: always; the arm knows its joint angles."""
+        return True
+
+    def calibrate(self) -> None:
+        """Nothing to do."""
+
+    def configure(self) -> None:
+        """Nothing to do: rates and limits are sent with each command."""
+
+    @check_if_already_connected
+    def connect(self, calibrate: bool = True) -> None:
+        """Connects cameras, gripper and arm, in this order, and holds the arm where it is.
+
+        Raises:
+            RobotFaultError: If one of them is not ready; nothing stays connected.
+        """
+        self._fault = None
+        self._pictures = {name: PictureCheck(name) for name in self.cameras}
+        self._orderly_end.begin()
+        try:
+            self._check_ready()
+            for name, camera in self.cameras.items():
+                try:
+                    camera.connect()
+                except Exception as error:
+                    raise RobotFaultError(Fault.CAMERA, f"camera '{name}' cannot be opened: {error}") from error
+            if self.config.gripper_port:
+                self._gripper = RobotiqGripper(self.config)
+                self._gripper.connect()
+            self._servo = Servo(self.config)
+            self._servo.start()
+        except BaseException:
+            self._release()
+            raise
+        logger.info("%s connected to %s.", self, self.config.ip)
+
+    def _check_ready(self) -> None:
+        """Asks the controller's dashboard, whose answers say more than a client that cannot start its program."""
+        _, _, dashboard_client = import_client()
+        dashboard = dashboard_client.DashboardClient(self.config.ip)
+        try:
+            dashboard.connect()
+            safety, mode = dashboard.safetystatus(), dashboard.robotmode()
+            is_remote = dashboard.isInRemoteControl()
+        except RuntimeError as error:
+            raise RobotFaultError(
+                Fault.LINK_LOST, f"no controller answers at {self.config.ip}, port 29999: {error}"
+            ) from error
+        finally:
+            with contextlib.suppress(RuntimeError):
+                dashboard.disconnect()
+        if "NORMAL" not in safety and "REDUCED" not in safety:
+            fault = Fault.EMERGENCY_STOP if "EMERGENCY" in safety else Fault.PROTECTIVE_STOP
+            raise RobotFaultError(fault, f"the safety status is '{safety}'")
+        if "RUNNING" not in mode:
+            raise RobotFaultError(Fault.NOT_RUNNING, f"the robot mode is '{mode}'")
+        if not is_remote:
+            raise RobotFaultError(Fault.PROGRAM_STOPPED, "the controller is in local control; make it remote")
+
+    @check_if_not_connected
+    def get_observation(self) -> RobotObservation:
+        """Measured joints, and the latest image of each camera.
+
+        Returns:
+            `RobotObservation`: `<joint>.pos` in rad, `gripper.pos` from 0 to 1, and images, (height, width, 3) uint8.
+
+        Raises:
+            RobotFaultError: If the arm was stopped, now or before.
+        """
+        with self._stopping_on_fault():
+            assert self._servo is not None
+            measured, _ = self._servo.read()
+            closure = self._gripper.closure if self._gripper is not None else 0.0
+            values = [*measured, closure]
+            observation: dict[str, Any] = {name: float(value) for name, value in zip(FEATURES, values, strict=True)}
+            for name, camera in self.cameras.items():
+                try:
+                    image = camera.read_latest(max_age_ms=MAX_IMAGE_AGE_MS)
+                except Exception as error:
+                    raise RobotFaultError(Fault.CAMERA, f"camera '{name}' gives no image: {error}") from error
+                self._pictures[name].check(image, measured)
+                observation[name] = fit_image(image, self.config.image_size)
+        return observation
+
+    @check_if_not_connected
+    def send_action(self, action: RobotAction) -> RobotAction:
+        """Moves towards joint targets, within the limits.
+
+        Args:
+            action (`RobotAction`):
+                `<joint>.pos` in rad and `gripper.pos` from 0 to 1.
+
+        Returns:
+            `RobotAction`: what was sent, which is what to record.
+
+        Raises:
+            ValueError: If the action has other keys or is not finite; nothing is sent and the arm holds its pose.
+            RobotFaultError: If the arm was stopped, now or before.
+        """
+        with self._stopping_on_fault():
+            assert self._servo is not None
+            asked, closure = self._limits.check(action)
+            measured, commanded = self._servo.read()
+            target = self._limits.limit(asked, commanded, measured)
+            if not self._warned and np.abs(target - asked).max() > self.config.command_limit:
+                self._warned = True
+                logger.warning(
+                    "An action asked for joints up to %.2f rad from what the limits allow; it and others are limited.",
+                    np.abs(target - asked).max(),
+                )
+            self._servo.move_to(target)
+            if self._gripper is not None:
+                self._gripper.move_to(closure)
+        return {name: float(value) for name, value in zip(FEATURES, [*target, closure], strict=True)}
+
+    @check_if_not_connected
+    def disconnect(self) -> None:
+        """Brings the arm to rest and lets go of everything; the gripper keeps what it holds."""
+        self._release()
+        logger.info("%s disconnected.", self)
+
+    @contextlib.contextmanager
+    def _stopping_on_fault(self) -> Iterator[None]:
+        if self._fault is not None:
+            raise self._fault
+        try:
+            yield
+        except RobotFaultError as fault:
+            assert self._servo is not None
+            self._servo.stop()
+            cause = self._servo.fault
+            if cause is None or cause.fault is fault.fault:
+                self._fault = fault
+                raise
+            # What stops the arm can take the gripper's power, too; the servo, which asks the controller, knows better.
+            self._fault = cause
+            raise cause from fault
+
+    def _release(self) -> None:
+        if self._servo is not None:
+            self._servo.stop()
+            self._servo = None
+        if self._gripper is not None:
+            self._gripper.disconnect()
+            self._gripper = None
+        for camera in self.cameras.values():
+            with contextlib.suppress(Exception):
+                if camera.is_connected:
+                    camera.disconnect()
+        self._orderly_end.end()
+
+
+def fit_image(image: np.ndarray, size: int) -> np.ndarray:
+    """The middle square of an image, (height, width, 3), resized to `size`; 0 leaves it as it is."""
+    if not size:
+        return image
+    height, width = image.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    square = image[top : top + side, left : left + side]
+    return cv2.resize(square, (size, size), interpolation=cv2.INTER_AREA)
+
+
+class PictureCheck:
+    """Notices images of a camera that arrive in time and still show nothing: black ones, and one that never changes."""
+
+    def __init__(self, camera: str, clock: Callable[[], float] = time.monotonic):
+        self._camera = camera
+        self._clock = clock
+        self._dark_since: float | None = None
+        self._last: NDArray[np.uint8] | None = None
+        self._last_since = 0.0
+        self._last_joints: NDArray[np.float64] = np.empty(0)
+
+    def check(self, image: NDArray[np.uint8], joints: NDArray[np.float64]) -> None:
+        """Looks at a picture, (height, width, 3), taken at measured joints in rad, (6,).
+
+        Raises a `RobotFaultError` if pictures have been black, or the same although the arm moved, for a second.
+        """
+        now = self._clock()
+        if image.mean() >= DARK:
+            self._dark_since = None
+        elif self._dark_since is None:
+            self._dark_since = now
+        elif now - self._dark_since >= WRONG_SECONDS:
+            raise RobotFaultError(
+                Fault.CAMERA, f"camera '{self._camera}' has been black for {now - self._dark_since:.1f} s"
+            )
+        if self._last is None or not np.array_equal(image, self._last):
+            self._last, self._last_since, self._last_joints = image.copy(), now, joints.copy()
+        elif now - self._last_since >= WRONG_SECONDS and np.abs(joints - self._last_joints).max() >= MOVED:
+            raise RobotFaultError(
+                Fault.CAMERA,
+                f"camera '{self._camera}' has sent the same picture for {now - self._last_since:.1f} s, in which the "
+                f"arm moved by {np.abs(joints - self._last_joints).max():.2f} rad",
+            )
+
+
+class OrderlyEnd:
+    """Lets a program that is told to end do so in order: as with Ctrl-C, what it has to close is closed.
+
+    Python ends at once on these signals. The arm is stopped in any case, but `lerobot-record` would lose every episode
+    of its session: LeRobot writes the ends of the files, without which they cannot be read, when the recording ends.
+    A program that deals with a signal by itself, or ignores it as under `nohup`, goes on doing so.
+    """
+
+    def __init__(self) -> None:
+        self._taken: list[int] = []
+
+    def begin(self) -> None:
+        """From now on these signals raise `SystemExit`. Only the main thread may do this; in others nothing happens."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for name in ENDING_SIGNALS:
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) == signal.SIG_DFL:
+                signal.signal(number, self._end)
+                self._taken.append(number)
+
+    def end(self) -> None:
+        """Restores what was before. Safe to call at any time."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        while self._taken:
+            number = self._taken.pop()
+            # Somebody else may have taken the signal over meanwhile.
+            if signal.getsignal(number) in (self._end, signal.SIG_IGN):
+                signal.signal(number, signal.SIG_DFL)
+
+    def _end(self, number: int, frame: FrameType | None) -> Any:
+        for taken in self._taken:
+            # Asked for once more, the program would be torn from what it closes.
+            signal.signal(taken, signal.SIG_IGN)
+        logger.warning("Ending, as asked for by %s: what is open is closed first.", signal.Signals(number).name)
+        raise SystemExit(128 + number)

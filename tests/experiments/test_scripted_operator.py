@@ -1,0 +1,155 @@
+"""The scripted operator: played by its teleoperator, its events lead the tool along the path and open doors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import teleoperators_fakes as fakes
+from scipy.spatial.transform import Rotation
+from scripted_operator import REST_PERIODS, TELEOPERATOR, ToolPath, events_along, plan
+from twin import write_events
+
+from env_door.env import DoorEnv
+from lerobot_ufrnn.teleoperators import SpaceMouseTwist, twist_teleoperator
+
+KINDS = ("push", "pull", "slide")
+
+
+def path_of(joints, closures=None) -> ToolPath:
+    """The path of the tool through joint angles, by the published Denavit-Hartenberg table."""
+    joints = np.array(joints)
+    positions, rotations = zip(*map(fakes.tool_pose, joints), strict=True)
+    closures = np.zeros(len(joints)) if closures is None else np.array(closures, dtype=np.float64)
+    return ToolPath(np.array(positions), Rotation.concatenate(rotations), closures, joints)
+
+
+def wander(steps=40, size=0.4) -> np.ndarray:
+    """Joint angles on a smooth way from one rest to another, all joints at once."""
+    ease = (1 - np.cos(np.linspace(0, np.pi, steps + 1)))[:, None] / 2
+    return fakes.READY + ease * size * np.array([0.5, -0.4, 0.6, 0.3, -0.5, 1.0])
+
+
+def still(steps) -> np.ndarray:
+    return np.repeat(fakes.READY[None], steps, axis=0)
+
+
+def seconds(events) -> float:
+    return sum(event.seconds for event in events)
+
+
+@pytest.fixture
+def play(monkeypatch, tmp_path):
+    """Plays events with the teleoperator that they are for, on an arm and at times that the test chooses."""
+
+    def play(events, arm, ticks, follow):
+        clock = fakes.Clock()
+        monkeypatch.setattr(twist_teleoperator, "ArmState", lambda *_: arm)
+        monkeypatch.setattr(twist_teleoperator, "monotonic", clock)
+        write_events(events, tmp_path / "events.jsonl")
+        teleop = SpaceMouseTwist(replace(TELEOPERATOR, device=tmp_path / "events.jsonl", calibration_dir=tmp_path))
+        teleop.connect()
+        actions = []
+        for tick in ticks:
+            actions.append(np.array(list(teleop.get_action().values())))
+            follow(actions[-1])
+            clock.now += tick
+        teleop.disconnect()
+        return np.array(actions)
+
+    return play
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.02, 0.1])
+def test_played_by_the_teleoperator_the_tool_comes_to_the_end_of_its_path(play, jitter):
+    joints = np.concatenate([wander(), np.repeat(wander()[-1:], 8, axis=0)])
+    path = path_of(joints, [0.0] * 41 + list(np.linspace(0.1, 0.8, 8)))
+    events = events_along(path)
+    ticks = 0.1 + np.random.default_rng(0).uniform(0, jitter, round(seconds(events) / 0.1) + 5)
+    arm = fakes.FakeArmState()
+    before = [arm.measured]
+
+    def trail(action):  # by one action
+        arm.measured = before[-1]
+        before.append(action[:6])
+
+    actions = play(events, arm, ticks, trail)
+    np.testing.assert_array_equal(actions[0], [*fakes.READY, 0.0])
+    position, rotation = fakes.tool_pose(actions[-1, :6])
+    np.testing.assert_allclose(position, path.positions[-1], atol=1e-4 if jitter == 0 else 2e-3)
+    assert (rotation * path.rotations[-1].inv()).magnitude() < (1e-3 if jitter == 0 else 0.01)
+    assert actions[-1, 6] == pytest.approx(0.8, abs=1e-6 if jitter == 0 else 0.1 + jitter)
+
+
+def test_the_path_is_followed_too_slowly_for_any_limit_of_the_teleoperator():
+    path = path_of(wander(steps=4, size=1.0))
+    moving = [event for event in events_along(path) if event.twist.any()]
+    assert all(event.seconds == 0.1 for event in moving)
+    twists = np.array([event.twist for event in moving])
+    assert 0.9 < np.abs(twists).max() <= 0.95
+    # All of the way, none of it twice: 0.1 m/s at full deflection.
+    np.testing.assert_allclose(twists[:, :3].sum(axis=0) * 0.1 * 0.1, path.positions[-1] - path.positions[0], atol=1e-9)
+    # A wrist that trails its target by 0.1 s is led by 0.07 rad at most, even by an action after 0.15 s.
+    turn = still(5) + np.linspace(0, 1, 5)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
+    needed = 1.0 * (0.15 + 0.1) / 0.07 / 0.95
+    assert needed <= seconds(events_along(path_of(turn))[1:]) <= needed + 0.1
+    # Where no limit asks for more, a step of the path takes its period.
+    slow = events_along(path_of(wander(steps=4, size=0.001)))
+    assert [event.seconds for event in slow] == pytest.approx([0.1 * REST_PERIODS, 0.1, 0.1, 0.1, 0.1])
+
+
+def test_the_gripper_moves_for_itself_between_rests_with_one_button_at_a_time():
+    events = events_along(path_of(still(8), [0, 0.2, 0.5, 0.73, 0.73, 0.4, 0.13, 0.3]))
+    assert not any(event.twist.any() for event in events)
+    rest = ((), pytest.approx(0.3))
+    # At a stroke a second, in whole periods, rounded up: 0.73 closing, a step without anything, 0.6 opening, 0.17.
+    assert [(event.buttons, event.seconds) for event in events] == [
+        rest,
+        *(rest, (("close",), pytest.approx(0.8)), rest),
+        ((), 0.1),
+        *(rest, (("open",), pytest.approx(0.6)), rest),
+        *(rest, (("close",), pytest.approx(0.2)), rest),
+    ]
+
+
+def test_a_path_that_moves_tool_and_gripper_at_once_is_refused():
+    with pytest.raises(ValueError, match="Step 0 of the path moves tool and gripper at once"):
+        events_along(path_of(wander()[[0, 9]], [0.0, 0.5]))
+
+
+@pytest.fixture(scope="module")
+def door() -> DoorEnv:
+    return DoorEnv(arm="ur5e")
+
+
+def test_the_plan_begins_where_the_arm_starts_and_is_the_same_for_all_doors_until_one_is_tried(door):
+    plans = {kind: plan(door, kind, seed=4) for kind in KINDS}
+    for kind, path in plans.items():
+        door.reset(seed=4, options={"kind": kind})
+        np.testing.assert_array_equal(path.joints[0], door.measured_joints()[:-1])
+        assert path.closures[[0, -1]].tolist() == [0.0, pytest.approx(0.73, abs=0.01)]
+        grasped = int(np.argmax(path.closures > 0))
+        np.testing.assert_array_equal(path.joints[:grasped], plans["push"].joints[:grasped])
+        # Push and pull turn the tool by 0.52 rad about the upright, each its own way, and slide does not.
+        twisted = Rotation.from_rotvec([0.95, 0, 0])
+        upright = (path.rotations[-1] * path.rotations[grasped].inv() * twisted.inv()).as_rotvec()
+        turn = {"push": 0.52, "pull": -0.52, "slide": 0}[kind]
+        np.testing.assert_allclose(upright, [0, 0, turn], atol=2e-3, err_msg=kind)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("jitter", [0.0, 0.1])
+def test_the_events_open_the_simulated_door(play, door, kind, jitter):
+    events = events_along(plan(door, kind, seed=1))
+    door.reset(seed=1, options={"kind": kind})
+    arm = fakes.FakeArmState(door.measured_joints()[:-1])
+
+    def follow(action):
+        door.advance(action)
+        arm.measured = door.measured_joints()[:-1]
+
+    # The physics takes steps of 0.1 s; an action that is late finds the arm where it was by then.
+    ticks = 0.1 + np.random.default_rng(2).uniform(0, jitter, round(15 / (0.1 + jitter / 2)))
+    assert seconds(events) < 15
+    play(events, arm, ticks, follow)
+    assert door.latch.is_open
+    assert door.latch.attempts == (kind,)

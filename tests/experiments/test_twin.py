@@ -1,0 +1,125 @@
+"""What the experiments on the twin share: a command is started, ended in order and its end is told."""
+
+import signal
+import sys
+
+import pytest
+import twin
+from twin import StockCommand, describe_failure, last_error, run
+from twin_faults import FaultsConfig
+from twin_recording import RecordingConfig
+from twin_trials import TrialsConfig
+
+
+def python(code: str) -> StockCommand:
+    command = StockCommand("lerobot-small")
+    assert command._arguments == ["-m", "lerobot.scripts.lerobot_small"]
+    command._arguments = ["-c", code]
+    return command
+
+
+def test_a_command_that_ends_without_saying_so_is_told():
+    with python("print('connected'); print('no arm'); raise SystemExit(3)") as command:
+        command.wait_for("connected", 30.0)
+        with pytest.raises(
+            RuntimeError, match=r"lerobot-small ended with status 3 before it printed 'moving'(.|\n)*no arm"
+        ):
+            command.wait_for("moving", 30.0)
+
+
+def test_a_command_that_takes_too_long_is_told():
+    with python("import time; time.sleep(60)") as command, pytest.raises(RuntimeError, match="'moving' within 0 s"):
+        command.wait_for("moving", 0.0)
+
+
+def test_a_command_heeds_an_interrupt_even_if_a_background_job_started_it():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with python("import time; print('here', flush=True); time.sleep(60)") as command:
+            command.wait_for("here", 30.0)
+            command.stop()
+            assert command.process.returncode == -signal.SIGINT
+            assert "KeyboardInterrupt" in command.output()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_command_that_does_not_heed_an_interrupt_is_killed(monkeypatch):
+    monkeypatch.setattr(twin, "END_SECONDS", 0.2)
+    code = "import signal, time; signal.signal(2, signal.SIG_IGN); print('here', flush=True); time.sleep(60)"
+    with python(code) as command:
+        command.wait_for("here", 30.0)
+    assert command.process.returncode == -signal.SIGKILL
+
+
+def test_the_last_error_is_what_the_user_saw():
+    output = """Traceback (most recent call last):
+  File "x.py", line 3, in <module>
+    raise ValueError
+ValueError: first
+
+During handling of the above exception, another exception occurred:
+
+lerobot_ufrnn.robots.errors.RobotFaultError: The arm was stopped (freeze): no data. To go on: look at it.
+INFO 2025-01-01 errors.py:12 Exiting
+"""
+    assert last_error(output) == "RobotFaultError: The arm was stopped (freeze): no data"
+    assert last_error("INFO all is well\nKeyboardInterrupt\n") == "KeyboardInterrupt"
+    assert last_error("INFO no Error in here\n") == ""
+    ending = "WARNING 2025-01-01 orderly_end.py:12 Ending, as asked for by SIGHUP: what is open is closed first.\n"
+    assert last_error(ending + "INFO 2025-01-01 Exiting\n") == "Ending, as asked for by SIGHUP"
+
+
+def test_a_failure_is_told_even_without_an_error():
+    assert describe_failure(1, "INFO connected\nValueError: no arm\nINFO bye\n") == "status 1: ValueError: no arm"
+    assert describe_failure(2, "usage\nrecord: error: unknown\n") == "status 2: record: error: unknown"
+    assert describe_failure(-9, "") == "status -9: it printed nothing"
+
+
+def test_a_script_tells_what_is_wrong_and_fails(monkeypatch):
+    def main(config):
+        raise KeyboardInterrupt if config.seed else RuntimeError("no arm")
+
+    for flag, end in (("--seed=0", "x.py: no arm"), ("--seed=1", 130)):
+        monkeypatch.setattr(sys, "argv", ["experiments/x.py", "--policy_path=x", "--trial_log=y", flag])
+        with pytest.raises(SystemExit) as stopped:
+            run(main, TrialsConfig)
+        assert stopped.value.code == end
+
+
+RECORDING = ["--dataset_dir=x", "--repo_id=me/door"]
+TRIALS = ["--policy_path=x", "--trial_log=y"]
+
+
+@pytest.mark.parametrize(
+    ("script", "flags", "message"),
+    [
+        (FaultsConfig, ["--injections=[]"], "--injections must be one or more of"),
+        (FaultsConfig, ["--injections=[earthquake]"], "got ['earthquake']"),
+        (FaultsConfig, ["--seed=-1"], "`seed` must be at least 0"),
+        (TrialsConfig, [*TRIALS, "--kinds=[up]"], "--kinds must be one or more of"),
+        (TrialsConfig, [*TRIALS, "--kinds=[push,push]"], "each once"),
+        (TrialsConfig, [*TRIALS, "--trials_per_kind=0"], "`trials_per_kind` must be at least 1"),
+        (TrialsConfig, [*TRIALS, "--seed=-1"], "`seed` must be at least 0"),
+        (TrialsConfig, [*TRIALS, "--duration=0"], "`duration` must be at most 3600 and above 0 s"),
+        (TrialsConfig, [*TRIALS, "--hold_seconds=99"], "`hold_seconds` must be at least 0 and at most 60 s"),
+        (RecordingConfig, [*RECORDING, "--kinds=[up]"], "kinds must be one or more of"),
+        (RecordingConfig, [*RECORDING, "--kinds=[push,push]"], "each once"),
+        (RecordingConfig, [*RECORDING, "--episodes_per_kind=0"], "must be at least 1, got 0"),
+        (RecordingConfig, [*RECORDING, "--seed=-1"], "got -1"),
+        (RecordingConfig, [*RECORDING, "--takes=0"], "`takes` must be at least 1"),
+        (
+            RecordingConfig,
+            [*RECORDING, "--episode_seconds=nan"],
+            "`episode_seconds` must be at least 12 and at most 60",
+        ),
+        (RecordingConfig, ["--dataset_dir=x", "--repo_id=door"], "repo_id must read"),
+        (RecordingConfig, ["--dataset_dir=x", "--repo_id=me/eval_door"], "for evaluations"),
+    ],
+)
+def test_flags_out_of_range_are_refused_before_anything_is_done(monkeypatch, script, flags, message):
+    monkeypatch.setattr(sys, "argv", ["experiments/x.py", *flags])
+    with pytest.raises(SystemExit) as stopped:
+        run(lambda config: None, script)
+    assert message in str(stopped.value.code)
