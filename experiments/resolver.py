@@ -1,9 +1,8 @@
 """Does this package install beside others? `python experiments/resolver.py` writes a table of it.
 
 Asks `uv pip compile` for an environment with this package and a partner, for each extra of LeRobot and for popular
-simulators and plug-ins, with Python 3.12 and 3.13. Nothing is installed; each answer takes seconds. Where there is
-none, LeRobot with the partner alone is asked, to tell whose fault it is. A yes may rest on an older version of the
-partner: the table names the chosen one.
+simulators and plug-ins, with Python 3.12 and 3.13. Nothing is installed; each answer takes seconds. LeRobot with the
+partner alone is asked, too: a no may be theirs, and a yes may rest on an older version of the partner.
 """
 
 import argparse
@@ -78,19 +77,21 @@ def reason(message: str) -> str:
 
 def row(uv: str, partner: str) -> dict[str, str]:
     """What becomes of one partner."""
-    entry, notes = {"beside": f"`{partner}`"}, []
+    entry, notes, name = {"beside": f"`{partner}`"}, [], partner.split("[")[0]
     for python in PYTHONS:
         chosen, message = resolve(uv, [f"lerobot_policy_ufrnn @ {ROOT.as_uri()}", partner], python)
         entry[f"Python {python}"] = "yes" if chosen else "no"
-        entry[f"its version ({python})"] = chosen.get(partner.split("[")[0], "")
+        entry[f"its version ({python})"] = chosen.get(name, "")
         entry[f"MuJoCo ({python})"] = chosen.get("mujoco", "")
-        if not chosen:
-            alone, alone_message = resolve(uv, [f"lerobot=={version('lerobot')}", partner], python)
-            if alone:
-                notes.append(f"{python}: {reason(message)}; with LeRobot alone: MuJoCo {alone.get('mujoco', 'none')}")
-            else:
-                notes.append(f"{python}: nor beside LeRobot alone: {reason(alone_message)}")
-    return entry | {"why not": "; ".join(notes)}
+        if chosen and name == "lerobot":
+            continue
+        alone, alone_message = resolve(uv, [f"lerobot=={version('lerobot')}", partner], python)
+        if alone and alone.get(name) != chosen.get(name):
+            with_mujoco = f"{alone.get(name)} with MuJoCo {alone.get('mujoco', 'none')}"
+            notes.append(f"{python}: beside LeRobot alone {with_mujoco}{message and '; ' + reason(message)}")
+        elif not alone:
+            notes.append(f"{python}: nor beside LeRobot alone: {reason(alone_message)}")
+    return entry | {"note": "; ".join(notes)}
 
 
 def to_markdown(rows: list[dict[str, str]]) -> str:
