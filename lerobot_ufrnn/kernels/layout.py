@@ -96,7 +96,7 @@ class Steps(NamedTuple):
     Attributes:
         hidden (`np.ndarray`), cell (`np.ndarray`): state that is kept after each step, (L, B, H).
         raw_cell (`np.ndarray`): cell state before it was perturbed, (L, B, H).
-        joint_input (`np.ndarray`), image_input (`np.ndarray`): what the lower cells read, (L, B, D_j or D_f + H_shared).
+        joint_input (`np.ndarray`), image_input (`np.ndarray`): of the lower cells, (L, B, D_j or D_f + H_shared).
         whole (`np.ndarray`): gates of the shared cell, and predicted means, (L, B, 4 H_shared + D).
         joint_gates (`np.ndarray`), image_gates (`np.ndarray`): (L, B, 4 hidden size).
         noise_std (`np.ndarray`): standard deviation of the noise, joints first, (L, B, 2).
