@@ -26,13 +26,13 @@ from typing import Any
 
 import pandas as pd
 from draccus.utils import ParsingError
-from env_door.limits import MAX_HOLD, MAX_OFFSET
 from epochs import Model, Schedule, read_model
 from jobs import locked, replace_text, run_command, stop
 from tables import HELD_COUNTS, KEY, RESULTS, SUCCESS_COUNTS, describe, read_table
 
 from env_door.checks import check_range
 from env_door.latch import KINDS, check_kinds
+from env_door.limits import MAX_HOLD, MAX_OFFSET
 from env_door.trials import first_of_each_kind, read_trials
 from lerobot_ufrnn.analysis.results import count_by_door
 from lerobot_ufrnn.commands.flags import parse_flags

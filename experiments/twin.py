@@ -169,6 +169,8 @@ def last_error(output: str) -> str:
 
     An error with its name, or what asked the command to end; empty if there is neither.
     """
+    # Without FFmpeg LeRobot warns at the start with the whole traceback of a decoder that it then does without.
+    output = re.sub(r"\[start of libtorchcodec.*?\[end of libtorchcodec", "", output, flags=re.S)
     errors = re.findall(
         r"^(?:\w+\.)*(\w+(?:Error|Exception|Interrupt)\b.*)|(Ending, as asked for by \w+)", output, re.M
     )

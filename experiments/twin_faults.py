@@ -123,7 +123,7 @@ def stop_after(samples: Sequence[Sample], begin: float) -> tuple[float | None, b
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one injection; an episode had been recorded before it."""
+    """What became of one injection."""
 
     name: str
     injection: Injection
@@ -136,11 +136,11 @@ class Outcome:
     message: str  # what the user saw; empty if nothing
     still_when_cleared: bool  # whether the arm stayed where it was when the injection was cleared
     left_running: tuple[str, ...]  # processes of the command that were still there after its end
-    episodes: tuple[int, ...]  # frames of each recorded episode that can be read
+    episodes: tuple[int, ...]  # frames of each recorded episode that can be read; one was recorded before
 
     @property
     def lost(self) -> bool:
-        """Whether an episode that was recorded before cannot be read in full."""
+        """Whether a recorded episode cannot be read in full."""
         return not self.episodes or 0 in self.episodes
 
     def problems(self) -> list[str]:
@@ -198,9 +198,8 @@ def describe(status: int) -> str:
 
 def report(outcomes: Sequence[Outcome], untried: Sequence[str]) -> str:
     """The table, in Markdown."""
-    table = markdown(pd.DataFrame([outcome.row() for outcome in outcomes])) if outcomes else ""
     note = f"\nNot tried, for the arm did not get into motion: {', '.join(untried)}.\n" if untried else ""
-    return table + note
+    return (markdown(pd.DataFrame([outcome.row() for outcome in outcomes])) if outcomes else "") + note
 
 
 # ── The experiment ────────────────────────────────────────────────────

@@ -1,6 +1,6 @@
-"""Fast CPU kernel: the same numbers as `recurrent.py` and `foresight.py`, compiled.
+"""Fast CPU kernel: the same numbers as `foresight.py` and `networks/sh_lstm.py`, compiled.
 
-From the inside out: `matmul` multiplies a few rows by a small matrix, `activations` squashes, `walk` goes through
-whole episodes with foresight and `walk_back` back again for the gradients, `layout` names what they pass to each other,
-`packing` lays the weights out for them, and `unroll` offers it all behind the signature of [`UFRNN`].
+From the inside out: `activations` squashes, `forward` goes through whole episodes with foresight and `backward` back
+again for the gradients, `layout` names what they pass to each other and lays the weights out for them, and `unroll`
+offers it all behind the signature of [`UFRNN`]. Products are BLAS calls, of as few and as large matrices as possible.
 """

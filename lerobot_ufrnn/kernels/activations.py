@@ -6,8 +6,6 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from .compile import compiled
-
 # Beyond this, tanh is 1 to float32's precision.
 _LIMIT = np.float32(8.3)
 # Rational minimax fit on [0, 8.3] (least squares, re-weighted by the error): 3e-8 off, before rounding.
@@ -38,16 +36,3 @@ def _tanh_of_type(x):
     if x == types.float64:
         return lambda x: math.tanh(x)
     return None
-
-
-@compiled
-def tanh_all(values: np.ndarray) -> None:
-    """Replaces each element of `values` (R, C) by its hyperbolic tangent.
-
-    Args:
-        values (`np.ndarray`):
-            Contiguous rows of float32 (3e-7 relative error) or float64 (exact to rounding).
-    """
-    for row in range(values.shape[0]):
-        for column in range(values.shape[1]):
-            values[row, column] = tanh(values[row, column])

@@ -1,96 +1,108 @@
-"""What the compiled functions pass to each other: weights, sizes, options, and what a walk leaves behind.
+"""What the compiled functions pass to each other: weights, sizes, options, and what a pass through episodes leaves.
 
 A state is two rows, hidden and cell, with the parts `[joint | image | shared]`. Gates are in the order input, forget,
-output, candidate; the weights of the first three are halved (see `packing.py`), since
-`sigmoid(a) = (1 + tanh(a / 2)) / 2`: so every gate is stored as a hyperbolic tangent.
+output, candidate; the weights of the first three are halved, since `sigmoid(a) = (1 + tanh(a / 2)) / 2`: so every gate
+is stored as a hyperbolic tangent.
 """
 
 from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
+
+from ..networks import SHLSTM
+
+
+class Sizes(NamedTuple):
+    """Numbers of joints and features, and hidden sizes of the three LSTMs."""
+
+    joint_dim: int
+    feature_dim: int
+    joint: int
+    image: int
+    shared: int
+
+
+class Options(NamedTuple):
+    """What `UFRNNConfig` says of prediction and foresight, in numbers; see `ForesightConfig`."""
+
+    log_variance_low: float
+    log_variance_high: float
+    explores: bool
+    selects: bool
+    horizon: int
+    noise_low: float
+    noise_high: float
+    noise_is_variance: bool
+
+
+class Cells(NamedTuple):
+    """Weights (inputs, gates) and biases (gates) of the cells.
+
+    Attributes:
+        shared: from `[h_joint | h_image | h_shared]`.
+        joint: from `[joints | h_shared]`.
+        image: from `[features | h_shared]`.
+    """
+
+    shared: Tensor
+    shared_bias: Tensor
+    joint: Tensor
+    joint_bias: Tensor
+    image: Tensor
+    image_bias: Tensor
 
 
 class Weights(NamedTuple):
-    """Weights as the compiled functions read them: panels of inputs x outputs, see `multiply_add`.
+    """Weights as the compiled functions read them.
 
     Attributes:
-        shared (`np.ndarray`): gates of the shared cell from `[h_joint | h_image | h_shared]`.
-        joint (`np.ndarray`): gates of the joint cell from `[joints | h_shared]`.
-        image (`np.ndarray`): gates of the image cell from `[features | h_shared]`.
-        joint_mean (`np.ndarray`): joint means before tanh, from `h_joint`.
-        image_mean (`np.ndarray`): feature means before tanh, from `h_image`.
-        joint_spread (`np.ndarray`): unbounded log-variances of the joints and the step scalar, from `h_joint`.
-        image_spread (`np.ndarray`): the same of the features, from `h_image`.
+        whole (`np.ndarray`): from a whole hidden state: gates of the shared cell, and the means (D) that it predicts.
+        joint (`np.ndarray`), image (`np.ndarray`): as of `Cells`.
+        spread (`np.ndarray`): from a whole hidden state: unbounded log-variances (D).
     """
 
-    shared: np.ndarray
-    shared_bias: np.ndarray
+    whole: np.ndarray
+    whole_bias: np.ndarray
     joint: np.ndarray
     joint_bias: np.ndarray
     image: np.ndarray
     image_bias: np.ndarray
-    joint_mean: np.ndarray
-    joint_mean_bias: np.ndarray
-    image_mean: np.ndarray
-    image_mean_bias: np.ndarray
-    joint_spread: np.ndarray
-    joint_spread_bias: np.ndarray
-    image_spread: np.ndarray
-    image_spread_bias: np.ndarray
+    spread: np.ndarray
+    spread_bias: np.ndarray
 
 
-class Sizes(NamedTuple):
-    """Sizes of the network: dimensions of joints and features, hidden sizes of the three cells."""
-
-    joint_dim: int
-    feature_dim: int
-    joint_hidden: int
-    image_hidden: int
-    shared_hidden: int
-
-
-class Options(NamedTuple):
-    """What `UFRNNConfig` says of prediction and foresight, in numbers.
+class Episodes(NamedTuple):
+    """What a pass through L steps of B episodes reads, N candidates a step.
 
     Attributes:
-        log_variance_low (`float`), log_variance_high (`float`): bounds of predicted log-variances.
-        perturbs (`bool`): whether any noise is added.
-        selects (`bool`): whether futures are imagined to select by.
-        horizon (`int`): steps imagined ahead, T.
-        learned_horizon (`bool`), own_baseline (`bool`), entropy (`bool`): see `Foresight`.
-        noise_low (`float`), noise_high (`float`), noise_is_variance (`bool`), log_scale (`bool`): see `NoiseSchedule`.
-        noise_columns (`tuple`): first column of the noise of each `HiddenState` field, -1 where it is not perturbed.
+        inputs (`np.ndarray`): scaled joints and image features, (L, B, D).
+        noise (`np.ndarray`): standard normal numbers, (L, N, B, H).
+        noise_bounds (`np.ndarray`): `low` and `high` of the `NoiseSchedule`, (2, 2).
+        hidden (`np.ndarray`), cell (`np.ndarray`): states before the first step, (B, H).
     """
 
-    log_variance_low: float
-    log_variance_high: float
-    perturbs: bool
-    selects: bool
-    horizon: int
-    learned_horizon: bool
-    own_baseline: bool
-    entropy: bool
-    noise_low: float
-    noise_high: float
-    noise_is_variance: bool
-    log_scale: bool
-    noise_columns: tuple[int, int, int, int, int, int]
+    inputs: np.ndarray
+    noise: np.ndarray
+    noise_bounds: np.ndarray
+    hidden: np.ndarray
+    cell: np.ndarray
 
 
 class Steps(NamedTuple):
-    """Everything that a walk through L steps of B episodes leaves behind; filled in place.
+    """Everything that a pass leaves behind; filled in place.
 
     Attributes:
         hidden (`np.ndarray`), cell (`np.ndarray`): state that is kept after each step, (L, B, H).
         raw_cell (`np.ndarray`): cell state before it was perturbed, (L, B, H).
-        joint_input (`np.ndarray`): input of the joint cell, `[joints | h_shared]` (L, B, D_j + H_s).
-        image_input (`np.ndarray`): input of the image cell, `[features | h_shared]` (L, B, D_f + H_s).
-        shared_gates (`np.ndarray`), joint_gates (`np.ndarray`), image_gates (`np.ndarray`): (L, B, 4 hidden, padded).
+        joint_input (`np.ndarray`), image_input (`np.ndarray`): of the lower cells, (L, B, D_j or D_f + H_shared).
+        whole (`np.ndarray`): gates of the shared cell, and predicted means, (L, B, 4 H_shared + D).
+        joint_gates (`np.ndarray`), image_gates (`np.ndarray`): (L, B, 4 hidden size).
         noise_std (`np.ndarray`): standard deviation of the noise, joints first, (L, B, 2).
         chosen (`np.ndarray`): kept candidate, (L, B).
-        baseline (`np.ndarray`), final (`np.ndarray`): uncertainty before and at the horizon, (L, N, B).
-        horizon (`np.ndarray`): imagined steps that counted, (L, N, B).
-        calmest (`np.ndarray`): imagined step of least uncertainty, from 1, (L, N, B); with a learned horizon.
+        baseline (`np.ndarray`): uncertainty before foresight, (L, B).
+        final (`np.ndarray`): uncertainty at the horizon, (L, N, B).
     """
 
     hidden: np.ndarray
@@ -98,36 +110,72 @@ class Steps(NamedTuple):
     raw_cell: np.ndarray
     joint_input: np.ndarray
     image_input: np.ndarray
-    shared_gates: np.ndarray
+    whole: np.ndarray
     joint_gates: np.ndarray
     image_gates: np.ndarray
     noise_std: np.ndarray
     chosen: np.ndarray
     baseline: np.ndarray
     final: np.ndarray
-    horizon: np.ndarray
-    calmest: np.ndarray
 
 
-class TransposedWeights(NamedTuple):
-    """Panels of outputs x inputs: from the gradient of the gates to that of their inputs.
+class Gradients(NamedTuple):
+    """What belongs to the gates of each cell: their gradients before tanh, (L, B, gates), or weights for these."""
 
-    Attributes:
-        shared (`np.ndarray`): to `[h_joint | h_image | h_shared]`.
-        joint (`np.ndarray`): to `h_shared`.
-        image (`np.ndarray`): to `h_shared`.
-        zeros (`np.ndarray`): a bias for all.
+    shared: np.ndarray
+    joint: np.ndarray
+    image: np.ndarray
+
+
+def pack_cells(network: SHLSTM) -> Cells:
+    """The cells' weights; gradients flow back to the network's parameters.
+
+    What the upper cell says to a lower one passes two linear maps in a row, `shared_to_lower` and the lower cell's
+    recurrent weights. Here they are one: `W_hh (W_d h + b_d) = (W_hh W_d) h + W_hh b_d`.
     """
+    shared = network.shared_cell
+    sizes = (network.joint_cell.hidden_size, network.image_cell.hidden_size)
+    down = zip(network.shared_to_lower.weight.split(sizes), network.shared_to_lower.bias.split(sizes), strict=True)
+    lower: list[Tensor] = []
+    for cell, (weight, bias) in zip((network.joint_cell, network.image_cell), down, strict=True):
+        lower += (
+            _order(torch.cat((cell.weight_ih, cell.weight_hh @ weight), dim=1)).T.contiguous(),
+            _order(cell.bias_ih + cell.bias_hh + cell.weight_hh @ bias),
+        )
+    return Cells(
+        _order(torch.cat((shared.weight_ih, shared.weight_hh), dim=1)).T.contiguous(),
+        _order(shared.bias_ih + shared.bias_hh),
+        *lower,
+    )
 
-    shared: np.ndarray
-    joint: np.ndarray
-    image: np.ndarray
-    zeros: np.ndarray
+
+def _order(values: Tensor) -> Tensor:
+    """PyTorch's gates (input, forget, candidate, output) to ours, all but the candidate halved."""
+    i, f, candidate, o = values.chunk(4)
+    return torch.cat((i / 2, f / 2, o / 2, candidate))
 
 
-class GateGradients(NamedTuple):
-    """Gradients of the gates before tanh, (L, B, 4 hidden, padded) each; padding is zero."""
+@torch.no_grad()
+def pack_weights(network: SHLSTM, cells: Cells) -> Weights:
+    """All weights, without gradient."""
+    joint, image, j, f = network.joint_head, network.image_head, network.joint_dim, network.feature_dim
 
-    shared: np.ndarray
-    joint: np.ndarray
-    image: np.ndarray
+    def from_whole_state(of_joints: slice, of_features: slice) -> tuple[Tensor, Tensor]:
+        weight = torch.block_diag(joint.weight[of_joints], image.weight[of_features])
+        bias = torch.cat((joint.bias[of_joints], image.bias[of_features]))
+        return torch.nn.functional.pad(weight, (0, network.shared_cell.hidden_size)).T, bias
+
+    mean, mean_bias = from_whole_state(slice(j), slice(f))
+    packed = (
+        torch.cat((cells.shared, mean), dim=1),
+        torch.cat((cells.shared_bias, mean_bias)),
+        *cells[2:],
+        *from_whole_state(slice(j, 2 * j), slice(f, 2 * f)),
+    )
+    return Weights(*(to_host(values).numpy() for values in packed))
+
+
+def to_host(values: Tensor) -> Tensor:
+    """What compiled code reads: contiguous on the CPU, float64 as it is and anything narrower as float32."""
+    number = torch.float64 if values.dtype == torch.float64 else torch.float32
+    return values.detach().to("cpu", number).contiguous()

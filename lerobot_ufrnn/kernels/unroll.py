@@ -3,56 +3,62 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Generator, Tensor
 from torch.autograd.function import once_differentiable
 
-from ..configuration_ufrnn import UFRNNConfig
-from ..foresight import UFRNN, Foresight, ForesightTrace, Memory
-from ..networks import SHLSTM, HiddenState, Prediction
-from .layout import GateGradients, Options, Sizes, Steps, TransposedWeights, Weights
-from .matmul import PANEL
-from .packing import Cells, Heads, pack_cells, pack_heads, to_panels
-from .walk import imagine, walk
-from .walk_back import walk_back
+from ..configuration_ufrnn import ForesightConfig, UFRNNConfig
+from ..foresight import UFRNN, ForesightTrace, Memory
+from ..networks import HiddenState, Prediction
+from .backward import pass_back
+from .forward import imagine, pass_through
+from .layout import Cells, Episodes, Gradients, Options, Sizes, Steps, Weights, pack_cells, pack_weights, to_host
+
+COMPILED = {
+    "perturbed_states": "hidden",
+    "variance_baseline": "common",
+    "variance_aggregation": "variance",
+    "horizon_mode": "fixed",
+    "noise_scale": "linear",
+}
+"""The one reading that is compiled of fields of `ForesightConfig` that offer several."""
+
+MOST_ROWS = 32
+"""States that are multiplied at once; BLAS shares larger products among threads of its own, which fight with ours."""
 
 
 def unsupported(config: UFRNNConfig) -> str | None:
-    """Name of a field whose value is not compiled."""
+    """The first setting that is not compiled, such as `foresight.horizon_mode='learned'`; nothing without foresight."""
+    if config.exploration == "none":
+        return None
+    for name, compiled in COMPILED.items():
+        if (value := getattr(config.foresight, name)) != compiled:
+            return f"foresight.{name}={value!r} (only {compiled!r})"
     return None
-
-
-class _Packed(NamedTuple):
-    """Weights on the CPU: the cells' as tensors that know where they come from, and all as `walk` reads them."""
-
-    cells: Cells
-    weights: Weights
 
 
 class FastUFRNN(UFRNN):
     """[`UFRNN`] with compiled code for the CPU.
 
-    Sequences are independent of each other and share PyTorch's number of threads; each comes out the same bit for bit,
-    whatever that number and the rest of the batch. With weights on another device, weights and inputs visit the CPU for
-    the recurrence: it is so small and so sequential that a GPU would spend its time on starting kernels.
+    Sequences are independent of each other and share PyTorch's number of threads. With weights on another device,
+    weights and inputs visit the CPU for the recurrence: it is so small and so sequential that a GPU would spend its
+    time on starting kernels. Imagined futures are not kept: `ForesightTrace.futures` is `None`.
 
-    Imagined futures are not kept: `ForesightTrace.futures` is `None`. Arguments are those of [`UFRNN`].
+    Args:
+        config (`UFRNNConfig`):
+            Configuration with its features filled in, of which nothing is [`unsupported`].
     """
 
     def __init__(self, config: UFRNNConfig):
         super().__init__(config)
-        network = self.network
-        self._sizes = Sizes(
-            network.joint_dim,
-            network.feature_dim,
-            network.joint_cell.hidden_size,
-            network.image_cell.hidden_size,
-            network.shared_cell.hidden_size,
-        )
-        self._packed: tuple[tuple[tuple[int, int], ...], _Packed] | None = None
+        network, (low, high) = self.network, config.log_variance_range
+        hidden_sizes = (config.joint_hidden_dim, config.image_hidden_dim, config.shared_hidden_dim)
+        self._sizes = Sizes(network.joint_dim, network.feature_dim, *hidden_sizes)
+        self._options = _options(config.foresight, config.exploration, float(low), float(high))
+        self._packed: tuple[tuple[tuple[int, int], ...], Cells, Weights] | None = None
         # Compiled code is made or loaded now, so that a robot's first tick does not wait for it.
         inputs = torch.zeros(1, network.joint_dim + network.feature_dim)
         self.advance(inputs, self.initial_memory(1), torch.Generator().manual_seed(0))
@@ -62,78 +68,55 @@ class FastUFRNN(UFRNN):
     ) -> tuple[Memory, ForesightTrace | None]:
         """See [`UFRNN.advance`]; carries no gradient."""
         with torch.no_grad(), torch.autocast(inputs.device.type, enabled=False):
-            packed = self._pack_once()
-            prediction, state, trace = self._walk(inputs.unsqueeze(1), memory.state, generator, packed, explore)
+            prediction, state, trace = self._unroll(inputs.unsqueeze(1), memory.state, generator, explore)
         now = Prediction(*(values[0] for values in prediction))
         return Memory(state, now), None if trace is None else trace.at(0)
-
-    def forward(self, inputs: Tensor, generator: Generator | None = None) -> tuple[Prediction, ForesightTrace | None]:
-        """See [`UFRNN.forward`]."""
-        start = self.network.initial_state(inputs.shape[0])
-        with torch.autocast(inputs.device.type, enabled=False):
-            prediction, _, trace = self._walk(inputs, start, generator, self._pack())
-        return Prediction(*(values.transpose(0, 1) for values in prediction)), trace
 
     @torch.no_grad()
     def imagine(self, state: HiddenState, num_steps: int) -> HiddenState:
         """See [`UFRNN.imagine`]."""
-        weights = self._pack_once().weights
-        starts = (_host(values).numpy() for values in _to_rows(state))
+        _, weights = self._pack_once()
+        starts = (to_host(values).numpy() for values in _to_rows(state))
         hidden, cell = (np.repeat(start[None], num_steps + 1, axis=0) for start in starts)
         _share(lambda first, last: imagine(weights, self._sizes, hidden, cell, first, last), hidden.shape[1])
         device = state.h_joint.device
         return self._to_state(torch.from_numpy(hidden).to(device), torch.from_numpy(cell).to(device))
 
-    def _to_state(self, hidden: Tensor, cell: Tensor) -> HiddenState:
-        """Inverse of `_to_rows`."""
-        h_joint, h_image, h_shared = hidden.split(self._sizes[2:], dim=-1)
-        c_joint, c_image, c_shared = cell.split(self._sizes[2:], dim=-1)
-        return HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)
+    def forward(self, inputs: Tensor, generator: Generator | None = None) -> tuple[Prediction, ForesightTrace | None]:
+        """See [`UFRNN.forward`]."""
+        start = self.network.initial_state(inputs.shape[0])
+        with torch.autocast(inputs.device.type, enabled=False):
+            prediction, _, trace = self._unroll(inputs, start, generator, explore=True)
+        return Prediction(*(values.transpose(0, 1) for values in prediction)), trace
 
-    def _walk(
-        self,
-        inputs: Tensor,
-        start: HiddenState,
-        generator: Generator | None,
-        packed: _Packed,
-        explore: bool = True,
+    def _unroll(
+        self, inputs: Tensor, start: HiddenState, generator: Generator | None, explore: bool
     ) -> tuple[Prediction, HiddenState, ForesightTrace | None]:
         """Predictions over time (L, B, ...), the last state (B, ...) and the trace of all steps."""
-        foresight, device = self.foresight, inputs.device
-        options = _options(self.network, foresight)
-        options = options._replace(perturbs=explore and options.perturbs, selects=explore and options.selects)
+        foresight, device, options = self.foresight, inputs.device, self._options
+        options = options._replace(explores=explore and options.explores, selects=explore and options.selects)
         batch_size, length = inputs.shape[:2]
         noise = torch.empty(length, 1, batch_size, 0)
-        if options.perturbs:
-            noise = torch.stack([foresight.sample_noise(start, generator) for _ in range(length)])  # (L, N, B, S)
+        if options.explores:
+            noise = torch.stack([foresight.sample_noise(start, generator) for _ in range(length)])  # (L, N, B, H)
+        bounds = torch.stack((foresight.schedule.low, foresight.schedule.high))
         hidden, cell = _to_rows(start)
-        schedule = foresight.schedule
-        episodes = _Episodes(
-            self._sizes,
-            options,
-            packed.weights,
-            _host(torch.stack((schedule.low, schedule.high))).numpy(),
-            _host(noise).numpy(),
-            _host(hidden).numpy(),
-            _host(cell).numpy(),
-        )
-        steps, inputs = episodes.steps, _host(inputs.transpose(0, 1))
+        time_first = to_host(inputs.transpose(0, 1))
+        episodes = Episodes(*(to_host(values).numpy() for values in (time_first, noise, bounds, hidden, cell)))
         if torch.is_grad_enabled():
-            kept = _Walk.apply(episodes, inputs, *packed.cells)
+            cells = pack_cells(self.network)
+            passage = _Passage(self._sizes, options, pack_weights(self.network, cells), episodes)
+            kept = _Unroll.apply(passage, inputs.transpose(0, 1), *cells)
         else:
-            episodes.walk(inputs.numpy())
-            kept = torch.from_numpy(steps.hidden)
-        states = self._to_state(kept.to(device), torch.from_numpy(steps.cell).to(device))  # (L, B, hidden size) each
+            passage = _Passage(self._sizes, options, self._pack_once()[1], episodes)
+            passage.forward()
+            kept = torch.from_numpy(passage.steps.hidden).to(device)
+        states = self._to_state(kept, torch.from_numpy(passage.steps.cell).to(device))  # (L, B, hidden size) each
         prediction = self.network.predict(states)
         last = HiddenState(*(values[-1] for values in states))
-        return prediction, last, _trace(steps, options, device) if options.selects else None
+        return prediction, last, _trace(passage.steps, options, device) if options.selects else None
 
-    def _pack(self) -> _Packed:
-        cells = Cells(*map(_host, pack_cells(self.network)))
-        heads = Heads(*map(_host, pack_heads(self.network)))
-        return _Packed(cells, Weights(*(weight.detach().numpy() for weight in (*cells, *heads))))
-
-    def _pack_once(self) -> _Packed:
+    def _pack_once(self) -> tuple[Cells, Weights]:
         """Packed weights, made anew only when a parameter was changed in place or replaced."""
         versions = tuple(
             (parameter.data_ptr(), parameter._version)
@@ -142,21 +125,32 @@ class FastUFRNN(UFRNN):
             if parameter is not None
         )
         if self._packed is None or self._packed[0] != versions:
-            self._packed = versions, self._pack()
-        return self._packed[1]
+            cells = pack_cells(self.network)
+            self._packed = versions, cells, pack_weights(self.network, cells)
+        return self._packed[1:]
+
+    def _to_state(self, hidden: Tensor, cell: Tensor) -> HiddenState:
+        """Inverse of `_to_rows`."""
+        h_joint, h_image, h_shared = hidden.split(self._sizes[2:], dim=-1)
+        c_joint, c_image, c_shared = cell.split(self._sizes[2:], dim=-1)
+        return HiddenState(h_joint, c_joint, h_image, c_image, h_shared, c_shared)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_packed": None}
 
 
+def _options(config: ForesightConfig, exploration: str, low: float, high: float) -> Options:
+    noise_low, noise_high = map(float, config.noise_range)
+    explores, selects = exploration != "none", exploration == "foresight"
+    return Options(low, high, explores, selects, config.horizon, noise_low, noise_high, config.noise_unit == "variance")
+
+
 def _trace(steps: Steps, options: Options, device: torch.device) -> ForesightTrace:
-    noise_std, chosen, baseline, final, horizon, calmest = (
-        torch.from_numpy(values).to(device)
-        for values in (steps.noise_std, steps.chosen, steps.baseline, steps.final, steps.horizon, steps.calmest)
+    noise_std, chosen, baseline, final = (
+        torch.from_numpy(values).to(device) for values in (steps.noise_std, steps.chosen, steps.baseline, steps.final)
     )
-    return ForesightTrace(
-        noise_std, chosen, baseline, final, horizon, calmest if options.learned_horizon else None, None
-    )
+    horizon = torch.full_like(final, options.horizon, dtype=torch.int64)
+    return ForesightTrace(noise_std, chosen, baseline.unsqueeze(1).expand_as(final), final, horizon, None, None)
 
 
 def _to_rows(state: HiddenState) -> tuple[Tensor, Tensor]:
@@ -165,147 +159,79 @@ def _to_rows(state: HiddenState) -> tuple[Tensor, Tensor]:
     return hidden, torch.cat((state.c_joint, state.c_image, state.c_shared), dim=-1)
 
 
-def _host(values: Tensor) -> Tensor:
-    """What compiled code reads: contiguous on the CPU, float64 as it is and anything narrower as float32."""
-    number = torch.float64 if values.dtype == torch.float64 else torch.float32
-    return values.to("cpu", number).contiguous()
+class _Passage:
+    """A batch of episodes on their way forward and back."""
 
+    def __init__(self, sizes: Sizes, options: Options, weights: Weights, episodes: Episodes):
+        self.sizes, self.options, self.weights, self.episodes = sizes, options, weights, episodes
+        (length, num_samples, batch_size, _), number = episodes.noise.shape, episodes.hidden.dtype
 
-def _options(network: SHLSTM, foresight: Foresight) -> Options:
-    low, high = network.log_variance_range
-    config = foresight.config
-    columns, column = [], 0
-    for name, size in zip(HiddenState._fields, network.state_sizes, strict=True):
-        columns.append(column if name in foresight.perturbed else -1)
-        column += size if name in foresight.perturbed else 0
-    return Options(
-        float(low),
-        float(high),
-        foresight.exploration != "none",
-        foresight.exploration == "foresight",
-        config.horizon,
-        config.horizon_mode == "learned",
-        config.variance_baseline == "candidate",
-        config.variance_aggregation == "entropy",
-        float(config.noise_range[0]),
-        float(config.noise_range[1]),
-        config.noise_unit == "variance",
-        config.noise_scale == "log",
-        tuple(columns),  # type: ignore[arg-type]
-    )
-
-
-class _Episodes:
-    """A batch of episodes on their way through `walk` and `walk_back`."""
-
-    def __init__(
-        self,
-        sizes: Sizes,
-        options: Options,
-        weights: Weights,
-        noise_bounds: np.ndarray,
-        noise: np.ndarray,
-        first_hidden: np.ndarray,
-        first_cell: np.ndarray,
-    ):
-        self.sizes, self.options, self.weights = sizes, options, weights
-        self.noise_bounds, self.noise = noise_bounds, noise
-        self.first_hidden, self.first_cell = first_hidden, first_cell
-        length, num_samples, batch_size, _ = noise.shape
-        number, hidden_size = first_hidden.dtype, first_hidden.shape[-1]
-
-        def of_episodes(*shape: int) -> np.ndarray:
-            return np.empty((length, batch_size, *shape), number)
-
-        def of_candidates(dtype: Any) -> np.ndarray:
-            return np.empty((length, num_samples, batch_size), dtype)
+        def room(*shape: int) -> np.ndarray:
+            return np.empty((length, *shape), number)
 
         self.steps = Steps(
-            hidden=of_episodes(hidden_size),
-            cell=of_episodes(hidden_size),
-            raw_cell=of_episodes(hidden_size),
-            joint_input=of_episodes(sizes.joint_dim + sizes.shared_hidden),
-            image_input=of_episodes(sizes.feature_dim + sizes.shared_hidden),
-            shared_gates=of_episodes(len(weights.shared_bias)),
-            joint_gates=of_episodes(len(weights.joint_bias)),
-            image_gates=of_episodes(len(weights.image_bias)),
-            noise_std=of_episodes(2),
+            hidden=room(batch_size, weights.whole.shape[0]),
+            cell=room(batch_size, weights.whole.shape[0]),
+            raw_cell=room(batch_size, weights.whole.shape[0]),
+            joint_input=room(batch_size, weights.joint.shape[0]),
+            image_input=room(batch_size, weights.image.shape[0]),
+            whole=room(batch_size, weights.whole.shape[1]),
+            joint_gates=room(batch_size, weights.joint.shape[1]),
+            image_gates=room(batch_size, weights.image.shape[1]),
+            noise_std=room(batch_size, 2),
             chosen=np.empty((length, batch_size), np.int64),
-            baseline=of_candidates(number),
-            final=of_candidates(number),
-            horizon=of_candidates(np.int64),
-            calmest=of_candidates(np.int64),
+            baseline=room(batch_size),
+            final=room(num_samples, batch_size),
         )
 
-    def walk(self, inputs: np.ndarray) -> None:
+    def forward(self) -> None:
         def some(first: int, last: int) -> None:
-            walk(
-                self.weights,
-                self.sizes,
-                self.options,
-                self.noise_bounds,
-                inputs,
-                self.noise,
-                self.first_hidden,
-                self.first_cell,
-                self.steps,
-                first,
-                last,
-            )
+            pass_through(self.weights, self.sizes, self.options, self.episodes, self.steps, first, last)
 
-        _share(some, inputs.shape[1])
+        _share(some, self.episodes.inputs.shape[1], self.episodes.noise.shape[1])
 
-    def walk_back(self, grad_kept: np.ndarray) -> GateGradients:
+    def backward(self, grad_kept: np.ndarray) -> Gradients:
         weights, sizes, steps = self.weights, self.sizes, self.steps
-        joint, image, shared = (_columns(panels) for panels in (weights.joint, weights.image, weights.shared))
-        transposed = TransposedWeights(
-            to_panels(shared.T).numpy(),
-            to_panels(joint[sizes.joint_dim :].T).numpy(),
-            to_panels(image[sizes.feature_dim :].T).numpy(),
-            np.zeros(len(shared) + PANEL, weights.shared.dtype),
+        back = Gradients(
+            np.ascontiguousarray(weights.whole[:, : 4 * sizes.shared].T),
+            np.ascontiguousarray(weights.joint[sizes.joint_dim :].T),
+            np.ascontiguousarray(weights.image[sizes.feature_dim :].T),
         )
-        gradients = GateGradients(
-            *(np.zeros_like(gates) for gates in (steps.shared_gates, steps.joint_gates, steps.image_gates))
-        )
+        shape = steps.hidden.shape[:2]
+        gradients = Gradients(*(np.empty((*shape, weight.shape[0]), weight.dtype) for weight in back))
 
         def some(first: int, last: int) -> None:
-            walk_back(transposed, sizes, steps, self.first_cell, grad_kept, gradients, first, last)
+            pass_back(back, sizes, steps, self.episodes.cell, grad_kept, gradients, first, last)
 
-        _share(some, grad_kept.shape[1])
+        _share(some, shape[1])
         return gradients
 
 
-class _Walk(torch.autograd.Function):
+class _Unroll(torch.autograd.Function):
     """Kept hidden states (L, B, H) of a batch of episodes; exact gradients of the inputs and of the cells' weights."""
 
     @staticmethod
-    def forward(ctx: Any, episodes: _Episodes, inputs: Tensor, *cells: Tensor) -> Tensor:
-        episodes.walk(inputs.detach().numpy())
-        ctx.episodes = episodes
-        return torch.from_numpy(episodes.steps.hidden)
+    def forward(ctx: Any, passage: _Passage, inputs: Tensor, *cells: Tensor) -> Tensor:
+        passage.forward()
+        ctx.passage, ctx.like = passage, inputs
+        return torch.from_numpy(passage.steps.hidden).to(inputs.device)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_kept: Tensor) -> tuple[Tensor | None, ...]:
-        episodes: _Episodes = ctx.episodes
-        sizes, weights, steps = episodes.sizes, episodes.weights, episodes.steps
-        gates = [torch.from_numpy(values) for values in episodes.walk_back(grad_kept.contiguous().numpy())]
-        before = np.concatenate((episodes.first_hidden[None], steps.hidden[:-1]))
+        passage: _Passage = ctx.passage
+        steps, weights, sizes = passage.steps, passage.weights, passage.sizes
+        gates = [torch.from_numpy(values) for values in passage.backward(to_host(grad_kept).numpy())]
+        before = np.concatenate((passage.episodes.hidden[None], steps.hidden[:-1]))
         cells: list[Tensor] = []
         for values, gradient in zip((before, steps.joint_input, steps.image_input), gates, strict=True):
-            weight = torch.from_numpy(values).flatten(0, 1).T @ gradient.flatten(0, 1)
-            cells += [to_panels(weight), gradient.sum((0, 1))]
+            cells += [torch.from_numpy(values).flatten(0, 1).T @ gradient.flatten(0, 1), gradient.sum((0, 1))]
         inputs = None
         if ctx.needs_input_grad[1]:
-            joints = gates[1] @ _columns(weights.joint)[: sizes.joint_dim].T
-            features = gates[2] @ _columns(weights.image)[: sizes.feature_dim].T
-            inputs = torch.cat((joints, features), dim=-1)
-        return None, inputs, *cells
-
-
-def _columns(panels: np.ndarray) -> Tensor:
-    """Panels (P, K, `PANEL`) -> matrix (K, P * `PANEL`)."""
-    return torch.from_numpy(panels).transpose(0, 1).flatten(1)
+            joints = gates[1] @ torch.from_numpy(weights.joint[: sizes.joint_dim]).T
+            features = gates[2] @ torch.from_numpy(weights.image[: sizes.feature_dim]).T
+            inputs = torch.cat((joints, features), dim=-1).to(ctx.like)
+        return None, inputs, *(cell.to(ctx.like) for cell in cells)
 
 
 @cache
@@ -313,12 +239,13 @@ def _pool(num_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_threads, thread_name_prefix="ufrnn")
 
 
-def _share(function: Callable[[int, int], None], count: int) -> None:
-    """Calls `function(first, last)` for shares of `count` episodes, on as many threads as PyTorch uses."""
+def _share(function: Callable[[int, int], None], count: int, rows_each: int = 1) -> None:
+    """Calls `function(first, last)` for shares of `count` sequences, on as many threads as PyTorch uses."""
     num_threads = min(torch.get_num_threads(), count)
-    if num_threads == 1:
+    num_shares = min(max(num_threads, -(-count * rows_each // MOST_ROWS)), count)
+    if num_shares == 1:
         function(0, count)
         return
-    bounds = [count * index // num_threads for index in range(num_threads + 1)]
+    bounds = [count * index // num_shares for index in range(num_shares + 1)]
     for _ in _pool(num_threads).map(function, bounds[:-1], bounds[1:]):
         pass  # asks for each result, so that an error is raised here

@@ -67,6 +67,11 @@ INFO 2025-01-01 errors.py:12 Exiting
     assert last_error(output) == "RobotFaultError: The arm was stopped (freeze): no data"
     assert last_error("INFO all is well\nKeyboardInterrupt\n") == "KeyboardInterrupt"
     assert last_error("INFO no Error in here\n") == ""
+    decoder = (
+        "[start of libtorchcodec loading traceback]\nOSError: no x.so\n[end of libtorchcodec loading traceback].\n"
+    )
+    assert last_error(f"WARNING no decoder\n{decoder}INFO Exiting\n") == ""
+    assert last_error(f"{decoder}RuntimeError: no arm\n") == "RuntimeError: no arm"
     ending = "WARNING 2025-01-01 orderly_end.py:12 Ending, as asked for by SIGHUP: what is open is closed first.\n"
     assert last_error(ending + "INFO 2025-01-01 Exiting\n") == "Ending, as asked for by SIGHUP"
 

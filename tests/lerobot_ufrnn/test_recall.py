@@ -587,7 +587,7 @@ def test_a_try_that_succeeded_is_not_refuted(monkeypatch):
 
 
 def test_each_episode_of_a_batch_is_on_its_own():
-    """The second goes back twice; the first never does and stays what it is alone, bit for bit."""
+    """The second goes back twice; the first never does and stays what it is alone, to rounding."""
     recall, plain = make_recall(FastUFRNN), small_model(FastUFRNN)
     memory, expected = recall.model.initial_memory(2), plain.initial_memory(1)
     generator = torch.Generator().manual_seed(0)
@@ -598,7 +598,7 @@ def test_each_episode_of_a_batch_is_on_its_own():
         memory, _ = recall.advance(torch.cat((first.inputs[-1], second.inputs[-1])), memory, generator)
         expected, _ = plain.advance(first.inputs[-1], expected)
         for ours, theirs, other in zip(memory.state, expected.state, second.now.state, strict=True):
-            assert torch.equal(ours[:1], theirs)
+            torch.testing.assert_close(ours[:1], theirs, rtol=0, atol=1e-12)
             torch.testing.assert_close(ours[1:], other, rtol=0, atol=1e-9)
     assert [len(events) for events in recall.events] == [0, 2]
     assert [event.step for event in recall.events[1]] == [event.step for event in second.events] == [21, 46]

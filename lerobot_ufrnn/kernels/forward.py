@@ -1,0 +1,216 @@
+"""Episodes through the SH-LSTM, with foresight at every step: `networks/sh_lstm.py` and `foresight.py`, compiled."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from .activations import tanh
+from .compile import compiled
+from .layout import Episodes, Options, Sizes, Steps, Weights
+
+
+class Room(NamedTuple):
+    """Where R states are worked on: rows of what `_step` fills, see `Steps`."""
+
+    joint_input: np.ndarray
+    image_input: np.ndarray
+    whole: np.ndarray
+    joint_gates: np.ndarray
+    image_gates: np.ndarray
+
+
+@compiled
+def _room(weights: Weights, num_rows: int, number: np.dtype) -> Room:
+    """Uninitialised."""
+    return Room(
+        np.empty((num_rows, weights.joint.shape[0]), number),
+        np.empty((num_rows, weights.image.shape[0]), number),
+        np.empty((num_rows, weights.whole.shape[1]), number),
+        np.empty((num_rows, weights.joint.shape[1]), number),
+        np.empty((num_rows, weights.image.shape[1]), number),
+    )
+
+
+@compiled
+def _squash(values: np.ndarray, bias: np.ndarray) -> None:
+    """`tanh(values + bias)` in place, row by row."""
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            values[row, column] = tanh(values[row, column] + bias[column])
+
+
+@compiled
+def _cell(gates: np.ndarray, hidden: np.ndarray, cell: np.ndarray, start: int, size: int) -> None:
+    """LSTM cell, given its gates: updates columns `start : start + size` of cell and hidden state."""
+    half = gates.dtype.type(0.5)
+    for row in range(gates.shape[0]):
+        input_gate, forget_gate = gates[row, :size], gates[row, size : 2 * size]
+        output_gate, candidate = gates[row, 2 * size : 3 * size], gates[row, 3 * size : 4 * size]
+        c, h = cell[row, start : start + size], hidden[row, start : start + size]
+        for unit in range(size):
+            c[unit] = (half + half * forget_gate[unit]) * c[unit] + (half + half * input_gate[unit]) * candidate[unit]
+        for unit in range(size):
+            h[unit] = (half + half * output_gate[unit]) * tanh(c[unit])
+
+
+@compiled
+def _step(weights: Weights, sizes: Sizes, hidden: np.ndarray, cell: np.ndarray, room: Room, imagines: bool) -> None:
+    """One SH-LSTM step of R states in place; it reads the sensor columns of both inputs, or imagines them first."""
+    first_image, first_shared, gates = sizes.joint, sizes.joint + sizes.image, 4 * sizes.shared
+    np.dot(hidden, weights.whole, room.whole)
+    _squash(room.whole, weights.whole_bias)
+    _cell(room.whole, hidden, cell, first_shared, sizes.shared)
+    for row in range(hidden.shape[0]):
+        joint_input, image_input, shared = room.joint_input[row], room.image_input[row], hidden[row, first_shared:]
+        if imagines:
+            for index in range(sizes.joint_dim):
+                joint_input[index] = room.whole[row, gates + index]
+            for index in range(sizes.feature_dim):
+                image_input[index] = room.whole[row, gates + sizes.joint_dim + index]
+        for unit in range(sizes.shared):
+            joint_input[sizes.joint_dim + unit] = shared[unit]
+            image_input[sizes.feature_dim + unit] = shared[unit]
+    np.dot(room.joint_input, weights.joint, room.joint_gates)
+    _squash(room.joint_gates, weights.joint_bias)
+    _cell(room.joint_gates, hidden, cell, 0, sizes.joint)
+    np.dot(room.image_input, weights.image, room.image_gates)
+    _squash(room.image_gates, weights.image_bias)
+    _cell(room.image_gates, hidden, cell, first_image, sizes.image)
+
+
+@compiled
+def _variances(weights: Weights, sizes: Sizes, options: Options, hidden: np.ndarray) -> np.ndarray:
+    """Mean predicted variance of each modality (R, 2): `bound_log_variance` and its exponential in one."""
+    least, most = math.exp(options.log_variance_low), math.exp(options.log_variance_high)
+    by_modality, raw = np.empty((hidden.shape[0], 2), hidden.dtype), np.dot(hidden, weights.spread)
+    for row in range(hidden.shape[0]):
+        for modality in range(2):
+            start = modality * sizes.joint_dim
+            size = sizes.feature_dim if modality else sizes.joint_dim
+            total = 0.0
+            for index in range(start, start + size):
+                total += least + most / (1 + most * math.exp(-raw[row, index] - weights.spread_bias[index]))
+            by_modality[row, modality] = total / size
+    return by_modality
+
+
+@compiled
+def _noise_std(options: Options, bounds: np.ndarray, variance: float) -> float:
+    """`NoiseSchedule`: standard deviation of the noise of one modality, given its range of variances (2,)."""
+    place = min(max((variance - bounds[0]) / max(bounds[1] - bounds[0], 1e-12), 0.0), 1.0)
+    noise = options.noise_low + (options.noise_high - options.noise_low) * place
+    return math.sqrt(noise) if options.noise_is_variance else noise
+
+
+@compiled
+def _perturb(sizes: Sizes, noise: np.ndarray, std: np.ndarray, hidden: np.ndarray, out: np.ndarray) -> None:
+    """Writes a noisy copy of one hidden state (H,), given standard normal noise (H,) and both modalities' std (2,)."""
+    for part in range(3):
+        start = (0, sizes.joint, sizes.joint + sizes.image)[part]
+        stop = start + (sizes.joint, sizes.image, sizes.shared)[part]
+        scale = std[part] if part < 2 else (std[0] + std[1]) / std.dtype.type(2)
+        for unit in range(start, stop):
+            out[unit] = hidden[unit] + scale * noise[unit]
+
+
+@compiled
+def _observe(
+    weights: Weights,
+    sizes: Sizes,
+    options: Options,
+    episodes: Episodes,
+    steps: Steps,
+    t: int,
+    first: int,
+    last: int,
+    hidden: np.ndarray,
+    cell: np.ndarray,
+) -> None:
+    """Reads the inputs of step t; the variance that the step before predicted for it sets the noise."""
+    if options.explores:
+        variances = _variances(weights, sizes, options, hidden)
+        for row in range(hidden.shape[0]):
+            for modality in range(2):
+                bounds = episodes.noise_bounds[:, modality]
+                steps.noise_std[t, first + row, modality] = _noise_std(options, bounds, variances[row, modality])
+            steps.baseline[t, first + row] = variances[row, 0] + variances[row, 1]
+    room = Room(
+        steps.joint_input[t, first:last],
+        steps.image_input[t, first:last],
+        steps.whole[t, first:last],
+        steps.joint_gates[t, first:last],
+        steps.image_gates[t, first:last],
+    )
+    room.joint_input[:, : sizes.joint_dim] = episodes.inputs[t, first:last, : sizes.joint_dim]
+    room.image_input[:, : sizes.feature_dim] = episodes.inputs[t, first:last, sizes.joint_dim :]
+    _step(weights, sizes, hidden, cell, room, False)
+    steps.raw_cell[t, first:last] = cell
+
+
+@compiled
+def _explore(
+    weights: Weights,
+    sizes: Sizes,
+    options: Options,
+    episodes: Episodes,
+    steps: Steps,
+    t: int,
+    first: int,
+    hidden: np.ndarray,
+    cell: np.ndarray,
+) -> None:
+    """Plays N noisy candidates of each state forward; the one that ends least uncertain is chosen.
+
+    The candidates of all episodes go through the network together, so that each weight is fetched once a step.
+    """
+    num_episodes, num_samples = hidden.shape[0], episodes.noise.shape[1]
+    room = _room(weights, num_samples * num_episodes, hidden.dtype)
+    noisy_hidden = np.empty((num_samples * num_episodes, hidden.shape[1]), hidden.dtype)
+    noisy_cell = np.empty_like(noisy_hidden)
+    for row in range(noisy_hidden.shape[0]):  # candidate-major
+        n, episode = row // num_episodes, row % num_episodes
+        noise, std = episodes.noise[t, n, first + episode], steps.noise_std[t, first + episode]
+        _perturb(sizes, noise, std, hidden[episode], noisy_hidden[row])
+        noisy_cell[row] = cell[episode]
+    for _ in range(options.horizon):
+        _step(weights, sizes, noisy_hidden, noisy_cell, room, True)
+    variances = _variances(weights, sizes, options, noisy_hidden)
+    for row in range(noisy_hidden.shape[0]):
+        n, episode = row // num_episodes, first + row % num_episodes
+        steps.final[t, n, episode] = variances[row, 0] + variances[row, 1]
+        now, best = steps.baseline[t, episode], steps.final[t, steps.chosen[t, episode], episode]
+        if now - steps.final[t, n, episode] > now - best:
+            steps.chosen[t, episode] = n
+
+
+@compiled
+def pass_through(
+    weights: Weights, sizes: Sizes, options: Options, episodes: Episodes, steps: Steps, first: int, last: int
+) -> None:
+    """Episodes `first` to `last - 1` of B, step by step: observe, explore, keep the chosen candidate's state."""
+    hidden, cell = episodes.hidden[first:last].copy(), episodes.cell[first:last].copy()
+    for t in range(episodes.inputs.shape[0]):
+        _observe(weights, sizes, options, episodes, steps, t, first, last, hidden, cell)
+        steps.chosen[t, first:last] = 0
+        if options.selects:
+            _explore(weights, sizes, options, episodes, steps, t, first, hidden, cell)
+        if options.explores:
+            for row in range(hidden.shape[0]):
+                noise = episodes.noise[t, steps.chosen[t, first + row], first + row]
+                _perturb(sizes, noise, steps.noise_std[t, first + row], hidden[row], hidden[row])
+        steps.hidden[t, first:last] = hidden
+        steps.cell[t, first:last] = cell
+
+
+@compiled
+def imagine(
+    weights: Weights, sizes: Sizes, hidden_steps: np.ndarray, cell_steps: np.ndarray, first: int, last: int
+) -> None:
+    """Goes on in closed loop from states `first` to `last - 1` of M, (T + 1, M, H), of which the first are given."""
+    hidden, cell = hidden_steps[0, first:last].copy(), cell_steps[0, first:last].copy()
+    room = _room(weights, hidden.shape[0], hidden.dtype)
+    for t in range(1, hidden_steps.shape[0]):
+        _step(weights, sizes, hidden, cell, room, True)
+        hidden_steps[t, first:last] = hidden
+        cell_steps[t, first:last] = cell
