@@ -7,7 +7,7 @@ import numpy as np
 
 from .activations import tanh
 from .compile import compiled
-from .layout import Episodes, Options, Sizes, Steps, Weights
+from .layout import Episodes, Model, Options, Sizes, Steps, Weights
 
 
 class Room(NamedTuple):
@@ -55,8 +55,9 @@ def _cell(gates: np.ndarray, hidden: np.ndarray, cell: np.ndarray, start: int, s
 
 
 @compiled
-def _step(weights: Weights, sizes: Sizes, hidden: np.ndarray, cell: np.ndarray, room: Room, imagines: bool) -> None:
+def _step(model: Model, hidden: np.ndarray, cell: np.ndarray, room: Room, imagines: bool) -> None:
     """One SH-LSTM step of R states in place; it reads the sensor columns of both inputs, or imagines them first."""
+    weights, sizes = model.weights, model.sizes
     first_image, first_shared, gates = sizes.joint, sizes.joint + sizes.image, 4 * sizes.shared
     np.dot(hidden, weights.whole, room.whole)
     _squash(room.whole, weights.whole_bias)
@@ -80,8 +81,9 @@ def _step(weights: Weights, sizes: Sizes, hidden: np.ndarray, cell: np.ndarray, 
 
 
 @compiled
-def _variances(weights: Weights, sizes: Sizes, options: Options, hidden: np.ndarray) -> np.ndarray:
+def _variances(model: Model, hidden: np.ndarray) -> np.ndarray:
     """Mean predicted variance of each modality (R, 2): `bound_log_variance` and its exponential in one."""
+    weights, sizes, options = model.weights, model.sizes, model.options
     least, most = math.exp(options.log_variance_low), math.exp(options.log_variance_high)
     by_modality, raw = np.empty((hidden.shape[0], 2), hidden.dtype), np.dot(hidden, weights.spread)
     for row in range(hidden.shape[0]):
@@ -116,24 +118,16 @@ def _perturb(sizes: Sizes, noise: np.ndarray, std: np.ndarray, hidden: np.ndarra
 
 @compiled
 def _observe(
-    weights: Weights,
-    sizes: Sizes,
-    options: Options,
-    episodes: Episodes,
-    steps: Steps,
-    t: int,
-    first: int,
-    last: int,
-    hidden: np.ndarray,
-    cell: np.ndarray,
+    model: Model, episodes: Episodes, steps: Steps, t: int, first: int, hidden: np.ndarray, cell: np.ndarray
 ) -> None:
     """Reads the inputs of step t; the variance that the step before predicted for it sets the noise."""
-    if options.explores:
-        variances = _variances(weights, sizes, options, hidden)
+    last, joint_dim, feature_dim = first + hidden.shape[0], model.sizes.joint_dim, model.sizes.feature_dim
+    if model.options.explores:
+        variances = _variances(model, hidden)
         for row in range(hidden.shape[0]):
             for modality in range(2):
                 bounds = episodes.noise_bounds[:, modality]
-                steps.noise_std[t, first + row, modality] = _noise_std(options, bounds, variances[row, modality])
+                steps.noise_std[t, first + row, modality] = _noise_std(model.options, bounds, variances[row, modality])
             steps.baseline[t, first + row] = variances[row, 0] + variances[row, 1]
     room = Room(
         steps.joint_input[t, first:last],
@@ -142,40 +136,32 @@ def _observe(
         steps.joint_gates[t, first:last],
         steps.image_gates[t, first:last],
     )
-    room.joint_input[:, : sizes.joint_dim] = episodes.inputs[t, first:last, : sizes.joint_dim]
-    room.image_input[:, : sizes.feature_dim] = episodes.inputs[t, first:last, sizes.joint_dim :]
-    _step(weights, sizes, hidden, cell, room, False)
+    room.joint_input[:, :joint_dim] = episodes.inputs[t, first:last, :joint_dim]
+    room.image_input[:, :feature_dim] = episodes.inputs[t, first:last, joint_dim:]
+    _step(model, hidden, cell, room, False)
     steps.raw_cell[t, first:last] = cell
 
 
 @compiled
 def _explore(
-    weights: Weights,
-    sizes: Sizes,
-    options: Options,
-    episodes: Episodes,
-    steps: Steps,
-    t: int,
-    first: int,
-    hidden: np.ndarray,
-    cell: np.ndarray,
+    model: Model, episodes: Episodes, steps: Steps, t: int, first: int, hidden: np.ndarray, cell: np.ndarray
 ) -> None:
     """Plays N noisy candidates of each state forward; the one that ends least uncertain is chosen.
 
     The candidates of all episodes go through the network together, so that each weight is fetched once a step.
     """
     num_episodes, num_samples = hidden.shape[0], episodes.noise.shape[1]
-    room = _room(weights, num_samples * num_episodes, hidden.dtype)
+    room = _room(model.weights, num_samples * num_episodes, hidden.dtype)
     noisy_hidden = np.empty((num_samples * num_episodes, hidden.shape[1]), hidden.dtype)
     noisy_cell = np.empty_like(noisy_hidden)
     for row in range(noisy_hidden.shape[0]):  # candidate-major
         n, episode = row // num_episodes, row % num_episodes
         noise, std = episodes.noise[t, n, first + episode], steps.noise_std[t, first + episode]
-        _perturb(sizes, noise, std, hidden[episode], noisy_hidden[row])
+        _perturb(model.sizes, noise, std, hidden[episode], noisy_hidden[row])
         noisy_cell[row] = cell[episode]
-    for _ in range(options.horizon):
-        _step(weights, sizes, noisy_hidden, noisy_cell, room, True)
-    variances = _variances(weights, sizes, options, noisy_hidden)
+    for _ in range(model.options.horizon):
+        _step(model, noisy_hidden, noisy_cell, room, True)
+    variances = _variances(model, noisy_hidden)
     for row in range(noisy_hidden.shape[0]):
         n, episode = row // num_episodes, first + row % num_episodes
         steps.final[t, n, episode] = variances[row, 0] + variances[row, 1]
@@ -185,32 +171,28 @@ def _explore(
 
 
 @compiled
-def pass_through(
-    weights: Weights, sizes: Sizes, options: Options, episodes: Episodes, steps: Steps, first: int, last: int
-) -> None:
+def pass_through(model: Model, episodes: Episodes, steps: Steps, first: int, last: int) -> None:
     """Episodes `first` to `last - 1` of B, step by step: observe, explore, keep the chosen candidate's state."""
     hidden, cell = episodes.hidden[first:last].copy(), episodes.cell[first:last].copy()
     for t in range(episodes.inputs.shape[0]):
-        _observe(weights, sizes, options, episodes, steps, t, first, last, hidden, cell)
+        _observe(model, episodes, steps, t, first, hidden, cell)
         steps.chosen[t, first:last] = 0
-        if options.selects:
-            _explore(weights, sizes, options, episodes, steps, t, first, hidden, cell)
-        if options.explores:
+        if model.options.selects:
+            _explore(model, episodes, steps, t, first, hidden, cell)
+        if model.options.explores:
             for row in range(hidden.shape[0]):
                 noise = episodes.noise[t, steps.chosen[t, first + row], first + row]
-                _perturb(sizes, noise, steps.noise_std[t, first + row], hidden[row], hidden[row])
+                _perturb(model.sizes, noise, steps.noise_std[t, first + row], hidden[row], hidden[row])
         steps.hidden[t, first:last] = hidden
         steps.cell[t, first:last] = cell
 
 
 @compiled
-def imagine(
-    weights: Weights, sizes: Sizes, hidden_steps: np.ndarray, cell_steps: np.ndarray, first: int, last: int
-) -> None:
+def imagine(model: Model, hidden_steps: np.ndarray, cell_steps: np.ndarray, first: int, last: int) -> None:
     """Goes on in closed loop from states `first` to `last - 1` of M, (T + 1, M, H), of which the first are given."""
     hidden, cell = hidden_steps[0, first:last].copy(), cell_steps[0, first:last].copy()
-    room = _room(weights, hidden.shape[0], hidden.dtype)
+    room = _room(model.weights, hidden.shape[0], hidden.dtype)
     for t in range(1, hidden_steps.shape[0]):
-        _step(weights, sizes, hidden, cell, room, True)
+        _step(model, hidden, cell, room, True)
         hidden_steps[t, first:last] = hidden
         cell_steps[t, first:last] = cell

@@ -73,6 +73,14 @@ class Weights(NamedTuple):
     spread_bias: np.ndarray
 
 
+class Model(NamedTuple):
+    """A network and how it explores."""
+
+    weights: Weights
+    sizes: Sizes
+    options: Options
+
+
 class Episodes(NamedTuple):
     """What a pass through L steps of B episodes reads, N candidates a step.
 

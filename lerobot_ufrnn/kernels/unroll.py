@@ -15,7 +15,7 @@ from ..foresight import UFRNN, ForesightTrace, Memory
 from ..networks import HiddenState, Prediction
 from .backward import pass_back
 from .forward import imagine, pass_through
-from .layout import Cells, Episodes, Gradients, Options, Sizes, Steps, Weights, pack_cells, pack_weights, to_host
+from .layout import Episodes, Gradients, Model, Options, Sizes, Steps, Weights, pack_cells, pack_weights, to_host
 
 COMPILED = {
     "perturbed_states": "hidden",
@@ -58,7 +58,7 @@ class FastUFRNN(UFRNN):
         hidden_sizes = (config.joint_hidden_dim, config.image_hidden_dim, config.shared_hidden_dim)
         self._sizes = Sizes(network.joint_dim, network.feature_dim, *hidden_sizes)
         self._options = _options(config.foresight, config.exploration, float(low), float(high))
-        self._packed: tuple[tuple[tuple[int, int], ...], Cells, Weights] | None = None
+        self._packed: tuple[tuple[tuple[int, int], ...], Weights] | None = None
         # Compiled code is made or loaded now, so that a robot's first tick does not wait for it.
         inputs = torch.zeros(1, network.joint_dim + network.feature_dim)
         self.advance(inputs, self.initial_memory(1), torch.Generator().manual_seed(0))
@@ -75,10 +75,10 @@ class FastUFRNN(UFRNN):
     @torch.no_grad()
     def imagine(self, state: HiddenState, num_steps: int) -> HiddenState:
         """See [`UFRNN.imagine`]."""
-        _, weights = self._pack_once()
+        model = Model(self._pack_once(), self._sizes, self._options)
         starts = (to_host(values).numpy() for values in _to_rows(state))
         hidden, cell = (np.repeat(start[None], num_steps + 1, axis=0) for start in starts)
-        _share(lambda first, last: imagine(weights, self._sizes, hidden, cell, first, last), hidden.shape[1])
+        _share(lambda first, last: imagine(model, hidden, cell, first, last), hidden.shape[1])
         device = state.h_joint.device
         return self._to_state(torch.from_numpy(hidden).to(device), torch.from_numpy(cell).to(device))
 
@@ -105,10 +105,10 @@ class FastUFRNN(UFRNN):
         episodes = Episodes(*(to_host(values).numpy() for values in (time_first, noise, bounds, hidden, cell)))
         if torch.is_grad_enabled():
             cells = pack_cells(self.network)
-            passage = _Passage(self._sizes, options, pack_weights(self.network, cells), episodes)
+            passage = _Passage(Model(pack_weights(self.network, cells), self._sizes, options), episodes)
             kept = _Unroll.apply(passage, inputs.transpose(0, 1), *cells)
         else:
-            passage = _Passage(self._sizes, options, self._pack_once()[1], episodes)
+            passage = _Passage(Model(self._pack_once(), self._sizes, options), episodes)
             passage.forward()
             kept = torch.from_numpy(passage.steps.hidden).to(device)
         states = self._to_state(kept, torch.from_numpy(passage.steps.cell).to(device))  # (L, B, hidden size) each
@@ -116,7 +116,7 @@ class FastUFRNN(UFRNN):
         last = HiddenState(*(values[-1] for values in states))
         return prediction, last, _trace(passage.steps, options, device) if options.selects else None
 
-    def _pack_once(self) -> tuple[Cells, Weights]:
+    def _pack_once(self) -> Weights:
         """Packed weights, made anew only when a parameter was changed in place or replaced."""
         versions = tuple(
             (parameter.data_ptr(), parameter._version)
@@ -125,9 +125,8 @@ class FastUFRNN(UFRNN):
             if parameter is not None
         )
         if self._packed is None or self._packed[0] != versions:
-            cells = pack_cells(self.network)
-            self._packed = versions, cells, pack_weights(self.network, cells)
-        return self._packed[1:]
+            self._packed = versions, pack_weights(self.network, pack_cells(self.network))
+        return self._packed[1]
 
     def _to_state(self, hidden: Tensor, cell: Tensor) -> HiddenState:
         """Inverse of `_to_rows`."""
@@ -162,8 +161,8 @@ def _to_rows(state: HiddenState) -> tuple[Tensor, Tensor]:
 class _Passage:
     """A batch of episodes on their way forward and back."""
 
-    def __init__(self, sizes: Sizes, options: Options, weights: Weights, episodes: Episodes):
-        self.sizes, self.options, self.weights, self.episodes = sizes, options, weights, episodes
+    def __init__(self, model: Model, episodes: Episodes):
+        self.model, self.episodes, weights = model, episodes, model.weights
         (length, num_samples, batch_size, _), number = episodes.noise.shape, episodes.hidden.dtype
 
         def room(*shape: int) -> np.ndarray:
@@ -186,12 +185,12 @@ class _Passage:
 
     def forward(self) -> None:
         def some(first: int, last: int) -> None:
-            pass_through(self.weights, self.sizes, self.options, self.episodes, self.steps, first, last)
+            pass_through(self.model, self.episodes, self.steps, first, last)
 
         _share(some, self.episodes.inputs.shape[1], self.episodes.noise.shape[1])
 
     def backward(self, grad_kept: np.ndarray) -> Gradients:
-        weights, sizes, steps = self.weights, self.sizes, self.steps
+        weights, sizes, steps = self.model.weights, self.model.sizes, self.steps
         back = Gradients(
             np.ascontiguousarray(weights.whole[:, : 4 * sizes.shared].T),
             np.ascontiguousarray(weights.joint[sizes.joint_dim :].T),
@@ -220,7 +219,7 @@ class _Unroll(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_kept: Tensor) -> tuple[Tensor | None, ...]:
         passage: _Passage = ctx.passage
-        steps, weights, sizes = passage.steps, passage.weights, passage.sizes
+        steps, weights, sizes = passage.steps, passage.model.weights, passage.model.sizes
         gates = [torch.from_numpy(values) for values in passage.backward(to_host(grad_kept).numpy())]
         before = np.concatenate((passage.episodes.hidden[None], steps.hidden[:-1]))
         cells: list[Tensor] = []
