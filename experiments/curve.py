@@ -3,7 +3,6 @@
 python experiments/curve.py
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +11,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
+from script import run
 from tables import RESULTS, SUCCESS_COUNTS, read_table
 
 from lerobot_ufrnn.analysis.colors import DOOR_COLORS
-from lerobot_ufrnn.commands.flags import parse_flags
 
 PANELS_PER_ROW = 3
 
@@ -89,15 +88,11 @@ def _draw_model(panel: Axes, table: pd.DataFrame) -> None:
         panel.xaxis.set_major_locator(MaxNLocator(3, integer=True, steps=[1, 2, 5, 10]))
 
 
-def main(arguments: list[str]) -> None:
+def main(config: CurveConfig) -> None:
     """Writes the picture."""
-    config = parse_flags(CurveConfig, arguments, "curve.py")
     draw(read_table(config.results, SUCCESS_COUNTS), config.output)
     print(f"Success over epochs: {config.output}")
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (ValueError, OSError) as error:
-        sys.exit(f"curve.py: {error}")
+    run(main, CurveConfig)

@@ -7,18 +7,17 @@ A network that predicts every single step well may still leave the demonstrated 
 predictions. Its imagined futures then end in poses that no arm ever went through, and trying them opens no door.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from lerobot.utils.random_utils import set_seed
+from script import run
 from torch import Tensor
 
 from env_door.checks import check_range
 from lerobot_ufrnn.analysis.hidden_states import read_demonstrations, states_along
-from lerobot_ufrnn.commands.flags import parse_flags
 from lerobot_ufrnn.commands.policies import load_policies
 from lerobot_ufrnn.episodes import Episode
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
@@ -59,9 +58,8 @@ def imagined_drift(policy: UFRNNPolicy, demonstrations: Sequence[Episode], num_s
     return drifts
 
 
-def main(arguments: list[str]) -> None:
+def main(config: DriftConfig) -> None:
     """Prints a table: a row for each policy."""
-    config = parse_flags(DriftConfig, arguments, "drift.py")
     print(
         f"Distance of {config.horizon} imagined steps from the nearest demonstrated pose in scaled units (0.8 is half\n"
         "the range of a joint): mean, and 95th percentile over where imagining starts.\n\n"
@@ -74,7 +72,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (ValueError, OSError) as error:
-        sys.exit(f"drift.py: {error}")
+    run(main, DriftConfig)

@@ -11,7 +11,6 @@ ever differs.
 """
 
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -20,9 +19,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from scipy import stats
+from script import run
 
 from lerobot_ufrnn.analysis.results import markdown
-from lerobot_ufrnn.commands.flags import parse_flags
 
 RESULTS = Path(__file__).parent / "results"
 KEY = ["model", "train_seed", "epoch", "kind"]
@@ -178,14 +177,11 @@ def _refuse(path: Path, wrong: pd.Series, problem: str) -> None:
         raise ValueError(f"{path}, line {wrong.idxmax() + 2} {problem}: repair or remove it.")
 
 
-def main(arguments: list[str]) -> None:
+def main(config: TablesConfig) -> None:
     """Prints the tables."""
-    for path in parse_flags(TablesConfig, arguments, "tables.py").results:
+    for path in config.results:
         print(f"## {path.name}\n\n{describe(read_table(path))}\n")
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (ValueError, OSError) as error:
-        sys.exit(f"tables.py: {error}")
+    run(main, TablesConfig)

@@ -9,31 +9,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from draccus.utils import ParsingError
 from numpy.typing import NDArray
 
 from env_door.twin import ports
-from lerobot_ufrnn.commands.flags import parse_flags
 
 FPS = 10  # control frequency in Hz, of simulation, robot and policies
 END_SECONDS = 30.0  # how long a command may take to end after an interrupt
 POLL_SECONDS = 0.02
-
-
-def run[Config](main: Callable[[Config], None], config_class: type[Config]) -> None:
-    """Runs a script with the flags of its command line; what is wrong is said without a traceback."""
-    name = Path(sys.argv[0]).name
-    try:
-        main(parse_flags(config_class, sys.argv[1:], f"python experiments/{name}"))
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (ValueError, OSError, RuntimeError, ParsingError) as error:
-        sys.exit(f"{name}: {error}")
 
 
 def robot_flags(address: str) -> list[str]:

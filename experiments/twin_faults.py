@@ -19,7 +19,8 @@ import pandas as pd
 import psutil
 import pyarrow.parquet
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from twin import Event, StockCommand, last_error, record_flags, run, write_events
+from script import run
+from twin import Event, StockCommand, last_error, record_flags, write_events
 
 from env_door.checks import check_range
 from env_door.twin import TwinProcess

@@ -18,8 +18,9 @@ from typing import Any
 
 import av
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from script import run
 from scripted_operator import events_along, plan
-from twin import FPS, Event, StockCommand, describe_failure, late_ticks, record_flags, run, write_events
+from twin import FPS, Event, StockCommand, describe_failure, late_ticks, record_flags, write_events
 
 from env_door.checks import check_range
 from env_door.env import DoorEnv

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from twin import FPS, StockCommand, describe_failure, late_ticks, robot_flags, run
+from script import run
+from twin import FPS, StockCommand, describe_failure, late_ticks, robot_flags
 
 from env_door.checks import check_range
 from env_door.latch import KINDS, check_kinds

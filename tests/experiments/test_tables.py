@@ -3,7 +3,7 @@ import statistics
 import matplotlib.axes
 import pandas as pd
 import pytest
-from curve import draw
+from curve import CurveConfig, draw
 from curve import main as curve
 from scipy import stats
 from sweep import add_to_table
@@ -12,6 +12,7 @@ from tables import (
     KEY,
     RESULTS,
     SUCCESS_COUNTS,
+    TablesConfig,
     differences,
     interval,
     interval_of_difference,
@@ -144,7 +145,7 @@ def test_models_of_several_networks_are_compared_and_variants_network_by_network
 
 
 def test_the_committed_tables_are_printed(capsys):
-    main([])
+    main(TablesConfig())
     out = capsys.readouterr().out
     assert all(path.name in out for path in RESULTS.glob("*.csv"))
     assert "| sh_rnn_noise | 83, 71, 95 | 83 [53, 100] |" in out
@@ -182,5 +183,5 @@ def test_a_single_epoch_is_a_bar_and_left_out_beside_others(tmp_path, stacks):
 
 def test_the_curve_is_a_command(tmp_path):
     (tmp_path / "table.csv").write_text(results().to_csv(index=False))
-    curve([f"--results={tmp_path / 'table.csv'}", f"--output={tmp_path / 'curve.png'}"])
+    curve(CurveConfig(tmp_path / "table.csv", tmp_path / "curve.png"))
     assert (tmp_path / "curve.png").exists()

@@ -5,7 +5,8 @@ import sys
 
 import pytest
 import twin
-from twin import StockCommand, describe_failure, last_error, run
+from script import run
+from twin import StockCommand, describe_failure, last_error
 from twin_faults import FaultsConfig
 from twin_recording import RecordingConfig
 from twin_trials import TrialsConfig

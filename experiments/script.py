@@ -1,0 +1,20 @@
+"""How the experiments are started: a function with the flags of a command line."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from draccus.utils import ParsingError
+
+from lerobot_ufrnn.commands.flags import parse_flags
+
+
+def run[Config](main: Callable[[Config], None], config_class: type[Config]) -> None:
+    """Runs a script with the flags of its command line; what is wrong is said without a traceback."""
+    name = Path(sys.argv[0]).name
+    try:
+        main(parse_flags(config_class, sys.argv[1:], f"python experiments/{name}"))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (ValueError, OSError, RuntimeError, ParsingError) as error:
+        sys.exit(f"{name}: {error}")
