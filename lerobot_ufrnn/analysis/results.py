@@ -1,9 +1,9 @@
 """Success per door, first tries and recoveries apart, with intervals over the trials of one network."""
 
-import math
 from collections.abc import Sequence
 
 import pandas as pd
+from scipy.stats import binomtest
 
 from env_door.trials import Trial
 
@@ -104,9 +104,7 @@ def format_rate(successes: int, trials: int) -> str:
     return f"{successes}/{trials} = {successes / trials:.0%} [{low:.0%}, {high:.0%}]"
 
 
-def wilson_interval(successes: int, trials: int, quantile: float = 1.959963984540054) -> tuple[float, float]:
-    """Wilson score interval of a success rate, 95 % by default: lower and upper bound, from 0 to 1."""
-    rate, weight = successes / trials, quantile**2 / trials
-    centre = rate + weight / 2
-    half = math.sqrt(weight * (rate * (1 - rate) + weight / 4))
-    return max(0.0, (centre - half) / (1 + weight)), min(1.0, (centre + half) / (1 + weight))
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95 % Wilson score interval of a success rate: lower and upper bound, from 0 to 1."""
+    interval = binomtest(successes, trials).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
