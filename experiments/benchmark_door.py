@@ -20,6 +20,7 @@ from timing import take_turns, text, write
 from env_door.configuration_door import DoorEnvConfig
 from env_door.env import DoorEnv
 from env_door.expert import DoorExpert
+from lerobot_ufrnn.commands import with_this_python
 
 
 def of_environment(seconds: float = 60.0, batch_size: int = 5, asynchronous=(False, True)) -> pd.DataFrame:
@@ -60,7 +61,7 @@ def of_environment(seconds: float = 60.0, batch_size: int = 5, asynchronous=(Fal
 def of_demo() -> pd.DataFrame:
     """`ufrnn demo` with default flags: its stages, what stock training logs, and the memory of its largest process."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "lerobot_ufrnn.commands", "demo", f"--output_dir={folder}/demo"]
+        command = [*with_this_python("ufrnn"), "demo", f"--output_dir={folder}/demo"]
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"ufrnn demo ended with status {done.returncode}:\n{done.stdout[-2000:]}")

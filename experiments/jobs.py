@@ -5,11 +5,12 @@ import fcntl
 import os
 import shlex
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from lerobot_ufrnn.commands import with_this_python
 
 stopping = threading.Event()
 running: set[subprocess.Popen] = set()
@@ -40,12 +41,6 @@ def locked(file: Path) -> Iterator[int]:
                 said = True
             stopping.wait(1)
         yield stream.fileno()
-
-
-def with_this_python(name: str) -> list[str]:
-    """A console command, run by this interpreter."""
-    module = "lerobot_ufrnn.commands" if name == "ufrnn" else f"lerobot.scripts.{name.replace('-', '_')}"
-    return [sys.executable, "-m", module]
 
 
 def run_command(name: str, *words: str, flags: dict[str, Any], log: Path, lock: int) -> None:

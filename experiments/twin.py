@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -16,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from env_door.limits import FPS
 from env_door.twin import ports
+from lerobot_ufrnn.commands import with_this_python
 
-FPS = 10  # control frequency in Hz, of simulation, robot and policies
 END_SECONDS = 30.0  # how long a command may take to end after an interrupt
 POLL_SECONDS = 0.02
 
@@ -83,12 +83,12 @@ class StockCommand:
 
     def __init__(self, name: str, *flags: str, **environment: str):
         self._name, self._environment = name, environment
-        self._arguments = ["-m", f"lerobot.scripts.{name.replace('-', '_')}", *flags]
+        self._arguments = [*with_this_python(name), *flags]
 
     def __enter__(self) -> "StockCommand":
         self._output = tempfile.TemporaryFile()
         self.process = subprocess.Popen(
-            [sys.executable, *self._arguments],
+            self._arguments,
             stdin=subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.STDOUT,

@@ -20,12 +20,13 @@ import av
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from script import run
 from scripted_operator import events_along, plan
-from twin import FPS, Event, StockCommand, describe_failure, late_ticks, record_flags, write_events
+from twin import Event, StockCommand, describe_failure, late_ticks, record_flags, write_events
 
 from env_door.checks import check_range
 from env_door.env import DoorEnv
 from env_door.kinematics import UnreachableError
 from env_door.latch import KINDS
+from env_door.limits import FPS
 from env_door.recording import CAMERA
 from env_door.recording_config import FrameEncoderConfig, RecordConfig
 from env_door.staging import StagedDirectory

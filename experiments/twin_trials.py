@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from script import run
-from twin import FPS, StockCommand, describe_failure, late_ticks, robot_flags
+from twin import StockCommand, describe_failure, late_ticks, robot_flags
 
 from env_door.checks import check_range
 from env_door.latch import KINDS, check_kinds
-from env_door.limits import MAX_HOLD
+from env_door.limits import FPS, MAX_HOLD
 from env_door.trials import Trial, append_trial, read_trials
 from env_door.twin import TwinProcess
 from lerobot_ufrnn.analysis.results import count_by_door, to_markdown

@@ -32,6 +32,12 @@ USAGE += (
 )
 
 
+def with_this_python(name: str) -> list[str]:
+    """A console command of ours or of LeRobot, such as `lerobot-train`, as one that this interpreter runs."""
+    module = __name__ if name == "ufrnn" else f"lerobot.scripts.{name.replace('-', '_')}"
+    return [sys.executable, "-m", module]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one subcommand: the function `run` of its module, with the configuration that `run` takes.
 

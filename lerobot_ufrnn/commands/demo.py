@@ -12,6 +12,8 @@ from pathlib import Path
 
 from env_door.checks import check_choice, check_range
 
+from . import with_this_python
+
 # Nothing here imports LeRobot or PyTorch: their memory would lie idle while the stages need it.
 EXPLORATIONS = ("foresight", "noise", "none")
 LAST_CHECKPOINT = Path("checkpoints/last/pretrained_model")
@@ -212,8 +214,7 @@ def start(name: str, *flags: str) -> None:
         KeyboardInterrupt: If it was interrupted.
     """
     print("$ " + shlex.join([name, *flags]), flush=True)
-    module = "lerobot_ufrnn.commands" if name == "ufrnn" else f"lerobot.scripts.{name.replace('-', '_')}"
-    status = subprocess.run([sys.executable, "-m", module, *flags], check=False).returncode
+    status = subprocess.run([*with_this_python(name), *flags], check=False).returncode
     if status in (-2, 130):
         raise KeyboardInterrupt
     if status != 0:

@@ -14,8 +14,8 @@ from twin_trials import TrialsConfig
 
 def python(code: str) -> StockCommand:
     command = StockCommand("lerobot-small")
-    assert command._arguments == ["-m", "lerobot.scripts.lerobot_small"]
-    command._arguments = ["-c", code]
+    assert command._arguments == [sys.executable, "-m", "lerobot.scripts.lerobot_small"]
+    command._arguments[1:] = ["-c", code]
     return command
 
 
