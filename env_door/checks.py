@@ -1,6 +1,10 @@
-"""One way to refuse a field of a configuration: what was given, and what is allowed."""
+"""One way to refuse a field of a configuration: what was given, and what is allowed.
+
+All raise a ParsingError, as the parser of LeRobot's command lines hides the text of a ValueError.
+"""
 
 import math
+import operator
 from collections.abc import Iterable
 
 from draccus.utils import ParsingError
@@ -28,22 +32,19 @@ def check_range(
             Bounds that are not allowed themselves.
         unit (`str`, *optional*, defaults to `""`):
             Unit of the bounds, for the message.
-
-    Raises:
-        ParsingError: If a value is out of range (the parser of LeRobot's command lines hides a ValueError's text).
     """
-    bounds = {"at least": low, "at most": high, "above": above, "below": below}
-    allowed = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if bound is not None) or "finite"
+    bounds = [
+        ("at least", operator.ge, low),
+        ("at most", operator.le, high),
+        ("above", operator.gt, above),
+        ("below", operator.lt, below),
+    ]
+    bounds = [(word, holds, bound) for word, holds, bound in bounds if bound is not None]
+    allowed = " and ".join(f"{word} {bound:g}" for word, _, bound in bounds) or "finite"
     for name in names:
         value = getattr(config, name)
         for number in value if isinstance(value, Iterable) else (value,):
-            if not (
-                math.isfinite(number)
-                and (low is None or number >= low)
-                and (high is None or number <= high)
-                and (above is None or number > above)
-                and (below is None or number < below)
-            ):
+            if not (math.isfinite(number) and all(holds(number, bound) for _, holds, bound in bounds)):
                 raise ParsingError(
                     f"`{name}` must be {allowed}{unit and ' ' + unit}, got {value} ({type(config).__name__})."
                 )
