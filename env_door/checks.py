@@ -33,18 +33,14 @@ def check_range(
         unit (`str`, *optional*, defaults to `""`):
             Unit of the bounds, for the message.
     """
-    bounds = [
-        ("at least", operator.ge, low),
-        ("at most", operator.le, high),
-        ("above", operator.gt, above),
-        ("below", operator.lt, below),
-    ]
-    bounds = [(word, holds, bound) for word, holds, bound in bounds if bound is not None]
-    allowed = " and ".join(f"{word} {bound:g}" for word, _, bound in bounds) or "finite"
+    words = {"at least": operator.ge, "at most": operator.le, "above": operator.gt, "below": operator.lt}
+    given = zip(words, (low, high, above, below), strict=True)
+    bounds = {word: bound for word, bound in given if bound is not None}
+    allowed = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items()) or "finite"
     for name in names:
         value = getattr(config, name)
         for number in value if isinstance(value, Iterable) else (value,):
-            if not (math.isfinite(number) and all(holds(number, bound) for _, holds, bound in bounds)):
+            if not (math.isfinite(number) and all(words[word](number, bound) for word, bound in bounds.items())):
                 raise ParsingError(
                     f"`{name}` must be {allowed}{unit and ' ' + unit}, got {value} ({type(config).__name__})."
                 )
