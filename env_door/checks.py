@@ -21,17 +21,7 @@ def check_range(
 ) -> None:
     """Refuses fields out of their range. A field of several numbers is checked one by one; none may be NaN or infinite.
 
-    Args:
-        config (`object`):
-            A configuration.
-        *names (`str`):
-            Its fields.
-        low (`float`, *optional*), high (`float`, *optional*):
-            Smallest and largest value allowed.
-        above (`float`, *optional*), below (`float`, *optional*):
-            Bounds that are not allowed themselves.
-        unit (`str`, *optional*, defaults to `""`):
-            Unit of the bounds, for the message.
+    `low` and `high` are allowed themselves, `above` and `below` are not; `unit` is theirs, for the message.
     """
     words = {"at least": operator.ge, "at most": operator.le, "above": operator.gt, "below": operator.lt}
     given = zip(words, (low, high, above, below), strict=True)

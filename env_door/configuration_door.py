@@ -38,29 +38,27 @@ def make_door(*, trial_log: str | None, **env_kwargs: Any) -> gym.Env:
 @EnvConfig.register_subclass("door")
 @dataclass
 class DoorEnvConfig(EnvConfig):
-    """Configuration of the door environment for `lerobot-eval` and `lerobot-train`.
-
-    Args:
-        task (`str`, *optional*, defaults to `"all"`):
-            Kind of door: `"push"`, `"pull"`, `"slide"` or `"random"` (drawn at each reset). Several kinds, such as
-            `"push,pull"` or `"all"` for every one, are evaluated one after the other, each reported by itself.
-        episode_length (`int`, *optional*, defaults to 300):
-            Steps after which a trial is cut.
-        arm, door_offset, start_variation, command_limit, hold_seconds:
-            As in [`~env_door.env.DoorEnv`].
-        trial_log (`str`, *optional*):
-            File that gets one JSON line for every finished trial, see [`~env_door.trials.read_trials`].
-    """
+    """Configuration of the door environment for `lerobot-eval` and `lerobot-train`."""
 
     task: str | None = "all"
+    """Kind of door: push, pull, slide or random (drawn at each reset). Several, such as push,pull or all, are evaluated
+    one after the other, each reported by itself."""
     fps: int = FPS
+    """Control steps a second; the environment runs at no other rate."""
     episode_length: int = EPISODE_STEPS
+    """Steps after which a trial is cut."""
     arm: str = "ur5e"
+    """ur5e or panda."""
     door_offset: float = 0.0
+    """Half-width in m of the range of the door's sideways shift."""
     start_variation: float = 0.02
+    """Half-width in m of the range of the tool's start position along each axis."""
     command_limit: float = 0.08
+    """Largest distance in rad of a command from the measured joints."""
     hold_seconds: float = 0.0
+    """For how long somebody holds the door still once it has begun to open."""
     trial_log: str | None = None
+    """File that gets one JSON line for every finished trial."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "pixels/front": f"{OBS_IMAGES}.front"}

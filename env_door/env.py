@@ -77,30 +77,21 @@ class DoorEnv(gym.Env):
 
     ## Arguments
 
-    Args:
-        kind (`str`, *optional*, defaults to `"random"`):
-            `"push"`, `"pull"`, `"slide"`, or `"random"` for a draw at every reset.
-        arm (`str`, *optional*, defaults to `"ur5e"`):
-            `"ur5e"` (6 joints) or `"panda"` (7 joints).
-        door_offset (`float`, *optional*, defaults to `0.0`):
-            Half-width in m, 0 to 0.05, of the range from which the door's sideways shift is drawn at every reset.
-        start_variation (`float`, *optional*, defaults to `0.02`):
-            Half-width in m, 0 to 0.05, of the range of the tool's start position along each axis.
-        command_limit (`float`, *optional*, defaults to `0.08`):
-            Largest distance in rad, 0.01 to 1, between a joint target and the measured joint; keeps a blocked arm from
-            folding up.
-        hold_seconds (`float`, *optional*, defaults to `0.0`):
-            Seconds, 0 to 60, for which somebody on the other side holds the door still, once in a trial: from the
-            first control step that leaves it at least 15 % open. 0 lets the door be.
-        observation_size (`int`, *optional*, defaults to `128`):
-            Height and width of the observed image in pixels, 16 to 768.
-        render_size (`int`, *optional*, defaults to `192`):
-            Height and width of the picture that `render` returns, 16 to 768.
-        render_mode (`str`, *optional*, defaults to `"rgb_array"`):
-            Only `"rgb_array"`.
+    | Argument           | Default       | What                                                                     |
+    |--------------------|---------------|--------------------------------------------------------------------------|
+    | `kind`             | `"random"`    | `"push"`, `"pull"`, `"slide"`, or `"random"`: drawn at every reset       |
+    | `arm`              | `"ur5e"`      | `"ur5e"` (6 joints) or `"panda"` (7 joints)                              |
+    | `door_offset`      | `0.0`         | half-width in m, 0 to 0.05, of the range of the door's sideways shift    |
+    | `start_variation`  | `0.02`        | half-width in m, 0 to 0.05, of the tool's start position along each axis |
+    | `command_limit`    | `0.08`        | largest distance in rad, 0.01 to 1, of a joint target from the measured  |
+    |                    |               | joint; keeps a blocked arm from folding up                               |
+    | `hold_seconds`     | `0.0`         | seconds, 0 to 60, for which somebody holds the door still, once in a     |
+    |                    |               | trial: from the first step that leaves it at least 15 % open             |
+    | `observation_size` | `128`         | height and width of the observed image in pixels, 16 to 768              |
+    | `render_size`      | `192`         | the same of the picture that `render` returns                            |
+    | `render_mode`      | `"rgb_array"` | nothing else                                                             |
 
-    Raises:
-        ValueError: If an argument is out of its range.
+    Another value is a ValueError.
 
     ## Version History
 

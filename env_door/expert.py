@@ -80,13 +80,9 @@ class Waypoint:
 
 
 class DoorExpert:
-    """Opens the door, after trying wrong directions first where told to; knows the knob's place, but not the kind.
+    """Opens the door of an unwrapped environment; knows the knob's place, but not the kind.
 
-    Args:
-        env (`DoorEnv`):
-            The unwrapped environment.
-        directions (`Sequence[str]`, *optional*, defaults to `("push",)`):
-            Directions to try in order, each one of `KINDS`; the last one is carried through.
+    Tries the `directions` in order, each one of `KINDS`, and carries the last one through.
     """
 
     def __init__(self, env: DoorEnv, directions: Sequence[str] = ("push",)):

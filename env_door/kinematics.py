@@ -30,18 +30,10 @@ class UnreachableError(ValueError):
 
 
 class InverseKinematics:
-    """Solver for one arm; keeps its own `MjData`, so the simulation is never disturbed.
+    """Solver for the arm whose joints are named; keeps its own `MjData`, so the simulation is never disturbed.
 
     Joint angles are in rad, shape `(num_joints,)`; poses of the tool are a position in m `(3,)` and a rotation matrix
-    `(3, 3)` in the world frame.
-
-    Args:
-        model (`mujoco.MjModel`):
-            The scene.
-        joints (`tuple[str, ...]`):
-            Names of the arm's joints.
-        max_iterations (`int`, *optional*, defaults to `200`):
-            Iterations after which a pose counts as unreachable.
+    `(3, 3)` in the world frame. A pose that is not found after `max_iterations` counts as unreachable.
     """
 
     def __init__(self, model: "mujoco.MjModel", joints: tuple[str, ...], max_iterations: int = 200):

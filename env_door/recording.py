@@ -130,13 +130,8 @@ def _write_episodes(config: RecordConfig, env: DoorEnv, staged: Path, group: lis
     if staged.exists():
         dataset = LeRobotDataset.resume(config.repo_id, **options)
     else:
-        dataset = LeRobotDataset.create(
-            config.repo_id,
-            fps=FPS,
-            features=_features(env),
-            robot_type=ROBOT_TYPES[config.arm],
-            **options,
-        )
+        robot = ROBOT_TYPES[config.arm]
+        dataset = LeRobotDataset.create(config.repo_id, FPS, _features(env), robot_type=robot, **options)
     try:
         for run in group:
             for image, state, action in zip(run.images, run.states, run.actions, strict=True):

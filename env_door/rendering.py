@@ -13,7 +13,7 @@ import importlib
 import os
 import sys
 import warnings
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -60,16 +60,6 @@ def _is_installed(backend: str) -> bool:
     except OSError:
         return False
     return True
-
-
-class Renderer(Protocol):
-    """Draws the scene from one of its cameras."""
-
-    def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Picture of the current state, shape `(size, size, 3)`."""
-
-    def close(self) -> None:
-        """Frees what the renderer holds."""
 
 
 class OpenGLRenderer:
@@ -132,18 +122,13 @@ class OpenGLRenderer:
             self.close()
 
 
-def make_renderer(model: mujoco.MjModel, camera: str, size: int, smooth: bool = False) -> Renderer:
-    """The best renderer that works here; ray-casting comes with a warning.
+Renderer = OpenGLRenderer | RayCastRenderer
 
-    Args:
-        model (`mujoco.MjModel`):
-            The scene.
-        camera (`str`):
-            Name of the camera.
-        size (`int`):
-            Height and width of the picture in pixels.
-        smooth (`bool`, *optional*, defaults to `False`):
-            Whether to smooth edges where OpenGL draws.
+
+def make_renderer(model: mujoco.MjModel, camera: str, size: int, smooth: bool = False) -> Renderer:
+    """The best renderer that works here, for square pictures; ray-casting comes with a warning.
+
+    `smooth` smooths edges where OpenGL draws.
 
     Raises:
         RuntimeError: If the user set `MUJOCO_GL` to a library that does not work here.

@@ -5,7 +5,6 @@ the first try or after a wrong one, is in the environment's `info` and would be 
 """
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -93,12 +92,8 @@ class TrialLog(gym.Wrapper):
 
 def append_trial(path: str | Path, trial: Trial) -> None:
     """Add a trial to a log, in a single write."""
-    line = json.dumps(asdict(trial)) + "\n"
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        os.write(descriptor, line.encode())
-    finally:
-        os.close(descriptor)
+    with open(path, "ab", buffering=0) as log:
+        log.write(json.dumps(asdict(trial)).encode() + b"\n")
 
 
 def read_trials(path: str | Path) -> list[Trial]:

@@ -1,7 +1,6 @@
 """The lock on its own: the arm is left out of it and loads are applied to the panel directly."""
 
 import mujoco
-import numpy as np
 import pytest
 
 from env_door.latch import KINDS, LOAD_STEPS, OPENINGS, Latch
@@ -146,15 +145,3 @@ def test_open_means_far_enough_and_nearly_still():
     for position, speed, is_open in ((0.45, 0.5, False), (0.45, 0.05, True), (0.35, 0.05, False)):
         door.data.joint("hinge").qpos, door.data.joint("hinge").qvel = position, speed
         assert door.is_open == is_open
-
-
-def test_reset_closes_a_freed_door():
-    door = Door("slide")
-    ranges = door.model.jnt_range.copy()
-    door.press("slide", 2.5)
-    assert not np.array_equal(door.model.jnt_range, ranges)
-    mujoco.mj_resetData(door.model, door.data)
-    door.reset("slide")
-    np.testing.assert_array_equal(door.model.jnt_range, ranges)
-    assert (door.freed, door.attempts) == (False, ())
-    assert door.data.eq_active.all()

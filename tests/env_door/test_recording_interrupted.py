@@ -34,15 +34,9 @@ KINDS_ALLOWED = r"^kinds must be one or more of \['push', 'pull', 'slide'\], eac
 
 def fake_demonstration(kind, seed):
     rng = np.random.default_rng([seed, KINDS.index(kind)])
-    return Demonstration(
-        kind=kind,
-        seed=seed,
-        images=rng.integers(0, 256, (NUM_STEPS, 128, 128, 3), dtype=np.uint8),
-        states=rng.normal(size=(NUM_STEPS, 7)).astype(np.float32),
-        actions=rng.normal(size=(NUM_STEPS, 7)).astype(np.float32),
-        branch_step=2,
-        success_step=4,
-    )
+    images = rng.integers(0, 256, (NUM_STEPS, 128, 128, 3), dtype=np.uint8)
+    states, actions = rng.normal(size=(2, NUM_STEPS, 7)).astype(np.float32)
+    return Demonstration(kind, seed, images, states, actions, branch_step=2, success_step=4)
 
 
 class Expert:
