@@ -59,15 +59,12 @@ def make():
         yield make
 
 
-def test_type_is_registered():
-    config = make_env_config("door", task="pull", door_offset=0.03)
-    assert isinstance(config, DoorEnvConfig)
-    assert (config.type, config.task, config.door_offset, config.fps) == ("door", "pull", 0.03, 10)
-
-
 @pytest.mark.parametrize(("arm", "dimension"), [("ur5e", 7), ("panda", 8)])
-def test_policy_features(arm, dimension):
-    features = env_to_policy_features(DoorEnvConfig(arm=arm))
+def test_type_is_registered_with_its_features(arm, dimension):
+    config = make_env_config("door", arm=arm)
+    assert isinstance(config, DoorEnvConfig)
+    assert (config.type, config.task, config.fps) == ("door", "all", 10)
+    features = env_to_policy_features(config)
     assert {key: (feature.type, feature.shape) for key, feature in features.items()} == {
         "action": (FeatureType.ACTION, (dimension,)),
         "observation.state": (FeatureType.STATE, (dimension,)),

@@ -40,14 +40,13 @@ def fake_demonstration(kind, seed):
 
 
 class Expert:
-    """The stand-in, which can be told to fail at some `(kind, seed)` and to raise an error at others."""
+    """The stand-in, which can be told to fail at some `(kind, seed)` and to be interrupted at others."""
 
-    def __init__(self):
-        self.failures, self.crashes = set(), {}
+    failures = interruptions = frozenset()
 
     def __call__(self, env, kind, seed, num_steps, door_offset):
-        if (kind, seed) in self.crashes:
-            raise self.crashes[kind, seed]
+        if (kind, seed) in self.interruptions:
+            raise KeyboardInterrupt
         return None if (kind, seed) in self.failures else fake_demonstration(kind, seed)
 
 
@@ -106,12 +105,12 @@ def test_interrupted_and_resumed_recording_equals_an_uninterrupted_one(tmp_path,
     whole = tmp_path / "other"
     expert.failures = {("slide", 1)}
     record_door(whole)
-    expert.crashes = {("pull", 2): KeyboardInterrupt()}
+    expert.interruptions = {("pull", 2)}
     with pytest.raises(KeyboardInterrupt):
         record_door(root)
     assert "3 of 9 episodes are safe" in caplog.text
     assert count_readable(root) == 3
-    expert.crashes = {}
+    expert.interruptions = {}
     report = record_door(root, resume=True)
     assert [episode["episode_index"] for episode in report.episodes] == [3, 4, 5, 6, 7, 8]
     assert (len(report.provenance.episodes), report.provenance.dropped_seeds) == (9, [1])
@@ -208,17 +207,19 @@ def test_seeds_at_which_the_expert_fails_are_dropped(root, expert, failures, opt
     assert count_readable(root) == len(recorded)
 
 
-def test_an_existing_folder_is_not_overwritten(root, expert):
-    with nothing_changes(root), pytest.raises(FileExistsError, match="--resume=true"):
-        record_door(root)
-
-
 @pytest.mark.parametrize(
-    ("option", "value"), [("seed", 5), ("kinds", ["push"]), ("door_offset", 0.02), ("matched", False)]
+    ("options", "error", "message"),
+    [
+        ({}, FileExistsError, "--resume=true"),
+        ({"resume": True, "seed": 5}, ValueError, "was recorded with seed=0, now seed=5"),
+        ({"resume": True, "kinds": ["push"]}, ValueError, "was recorded with kinds="),
+        ({"resume": True, "door_offset": 0.02}, ValueError, "was recorded with door_offset="),
+        ({"resume": True, "matched": False}, ValueError, "was recorded with matched="),
+    ],
 )
-def test_resuming_with_other_settings_is_refused(root, expert, option, value):
-    with nothing_changes(root), pytest.raises(ValueError, match=f"was recorded with {option}="):
-        record_door(root, resume=True, **{option: value})
+def test_a_dataset_is_neither_overwritten_nor_resumed_with_other_settings(root, expert, options, error, message):
+    with nothing_changes(root), pytest.raises(error, match=message):
+        record_door(root, **options)
 
 
 def test_resuming_a_folder_that_is_no_recording_is_refused(root, expert):

@@ -73,9 +73,10 @@ def path(tmp_path):
     return tmp_path / "logs" / "trials.jsonl"
 
 
-def test_success_and_time_limit_are_logged_once_each(path):
-    # The first goes on after success and past the time limit.
-    play(TrialLog(gym.wrappers.TimeLimit(ScriptedDoor(("pull", "push")), 7), path), seed=3, num_steps=9)
+def test_success_and_time_limit_are_logged_once_each_and_an_abandoned_trial_is_not(path):
+    env = TrialLog(gym.wrappers.TimeLimit(ScriptedDoor(("pull", "push")), 7), path)
+    play(env, seed=2, num_steps=1)
+    play(env, seed=3, num_steps=9)  # goes on after success and past the time limit
     play(TrialLog(gym.wrappers.TimeLimit(ScriptedDoor(), 4), path), seed=None, num_steps=4)
     opened, cut = read_trials(path)
     assert opened == Trial(3, "push", True, 5, ("pull", "push"), 1.0, 0.01)
@@ -102,13 +103,6 @@ def test_a_log_from_before_there_were_holds_is_read(path):
     (old,) = read_trials(path)
     assert old == trial(("push",))
     assert (old.held_at, old.tried_while_held, old.opened_after_hold) == (None, (), False)
-
-
-def test_abandoned_trial_is_not_logged(path):
-    env = TrialLog(ScriptedDoor(), path)
-    play(env, seed=1, num_steps=1)
-    play(env, seed=2)
-    assert [(seen.seed, seen.steps) for seen in read_trials(path)] == [(2, 5)]
 
 
 def test_parallel_writers_do_not_mix_lines(path):
