@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from draccus.utils import ParsingError
 from huggingface_hub.utils import HFValidationError, validate_repo_id
@@ -36,27 +36,19 @@ class FrameEncoderConfig(RGBEncoderConfig):
 
 
 @dataclass
-class RecordConfig:
-    """What to record, and where to."""
+class DatasetConfig:
+    """Where to record to, whatever the environment; its ways, such as kinds of door, are `kinds` in a subclass."""
 
     repo_id: str
     """Name of the dataset, {hf_username}/{dataset_name}."""
     root: str | Path | None = None
     """Folder of the dataset; by default $HF_LEROBOT_HOME/{repo_id}."""
     episodes_per_kind: int = 5
-    """Episodes to save for each kind of door."""
-    kinds: list[str] = field(default_factory=lambda: list(KINDS))
-    """Kinds of door to record: push, pull, slide."""
-    arm: str = "ur5e"
-    """ur5e or panda."""
-    door_offset: float = 0.0
-    """Half-width in m, 0 to 0.05, of the range of the door's lateral shift: spread evenly if matched, else drawn."""
+    """Episodes to save for each kind of door or way."""
     seed: int = 0
     """First seed; the following episodes count up from it."""
     matched: bool = True
-    """Use the same seeds for every kind."""
-    num_steps: int = 150
-    """Frames of an episode, 10 a second."""
+    """Use the same seeds for every kind or way."""
     rgb_encoder: FrameEncoderConfig = field(default_factory=FrameEncoderConfig)
     """Video encoder; by default one that keeps the kind of the door out of earlier frames."""
     push_to_hub: bool = False
@@ -68,6 +60,9 @@ class RecordConfig:
     resume: bool = False
     """Go on with an interrupted recording, or extend a finished one."""
 
+    robot_type: ClassVar[str | None] = None
+    hint: ClassVar[str] = ""  # what may help an expert that keeps failing
+
     def __post_init__(self) -> None:
         wanted = "repo_id must read {hf_username}/{dataset_name}, for example my-name/door"
         try:
@@ -78,11 +73,8 @@ class RecordConfig:
             raise ParsingError(f"{wanted}; got {self.repo_id!r}.")
         if "/eval_" in self.repo_id:
             raise ParsingError(f"Dataset names starting with 'eval_' are reserved for evaluations, got {self.repo_id}.")
-        check_range(self, "episodes_per_kind", "num_steps", low=1)
+        check_range(self, "episodes_per_kind", low=1)
         check_range(self, "seed", low=0)
-        check_choice(self, "arm", ROBOT_TYPES)
-        check_range(self, "door_offset", low=0.0, high=MAX_OFFSET, unit="m")
-        check_kinds(self.kinds, "kinds")
 
     @property
     def path(self) -> Path:
@@ -92,9 +84,40 @@ class RecordConfig:
     @property
     def total_episodes(self) -> int:
         """Episodes of the complete dataset."""
-        return self.episodes_per_kind * len(self.kinds)
+        return self.episodes_per_kind * len(self.kinds)  # type: ignore[attr-defined]
 
     @property
     def settings(self) -> dict[str, Any]:
         """The options that every episode of a dataset must share."""
         return {name: value for name, value in asdict(self).items() if name not in FREE_OPTIONS}
+
+
+@dataclass
+class RecordConfig(DatasetConfig):
+    """What to record of the door, and where to."""
+
+    kinds: list[str] = field(default_factory=lambda: list(KINDS))
+    """Kinds of door to record: push, pull, slide."""
+    arm: str = "ur5e"
+    """ur5e or panda."""
+    door_offset: float = 0.0
+    """Half-width in m, 0 to 0.05, of the range of the door's lateral shift: spread evenly if matched, else drawn."""
+    num_steps: int = 150
+    """Frames of an episode, 10 a second."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, "num_steps", low=1)
+        check_choice(self, "arm", ROBOT_TYPES)
+        check_range(self, "door_offset", low=0.0, high=MAX_OFFSET, unit="m")
+        check_kinds(self.kinds, "kinds")
+
+    @property
+    def robot_type(self) -> str:
+        """Name of the real robot whose joints these are."""
+        return ROBOT_TYPES[self.arm]
+
+    @property
+    def hint(self) -> str:
+        """What may help an expert that keeps failing."""
+        return f" With num_steps={self.num_steps} it may lack the time to open the door; 150 is enough for every kind."

@@ -1,7 +1,6 @@
 """The scripted demonstrator, who knows the way."""
 
 import math
-from os.path import commonprefix
 
 import numpy as np
 
@@ -27,7 +26,8 @@ class Demonstrator:
         # The same waves for all ways, so that nothing before the fork tells which one follows.
         self._longest = max(lengths(route(env, way))[-1] for way in env.task.ways)
         paths = [env.task.path(way) for way in env.task.ways]
-        self._fork = self._lengths[len(commonprefix(paths)) - 1] if len(paths) > 1 else math.inf
+        shared = sum(len(set(nodes)) == 1 for nodes in zip(*paths, strict=False))
+        self._fork = self._lengths[shared - 1] if len(paths) > 1 else math.inf
         self._travelled = 0.0
         self._steps = 0
 
@@ -74,7 +74,9 @@ def demonstrate(env: ForksEnv, way: int, seed: int) -> Demonstration | None:
     """
     observation, _ = env.reset(seed=seed, options={"way": way, "demonstration": True})
     demonstrator = Demonstrator(env, np.random.default_rng([seed, TIMING_STREAM]))
-    images, states, actions = [], [], []
+    images: list[np.ndarray] = []
+    states: list[np.ndarray] = []
+    actions: list[np.ndarray] = []
     branch_step = success_step = None
     rested = 0
     while rested < REST_STEPS and len(actions) < MAX_STEPS:

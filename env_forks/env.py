@@ -68,7 +68,7 @@ class ForksEnv(gym.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (Gymnasium declares it so)
-    joint_names = ("x", "y")
+    joint_names: tuple[str, ...] = ("x", "y")
     task_description = "find the way through"
 
     def __init__(
@@ -124,7 +124,7 @@ class ForksEnv(gym.Env):
         """Moves towards a target for 0.1 s."""
         target = np.asarray(action, float)
         if target.shape != (2,) or not np.isfinite(target).all():
-            raise ValueError(f"An action must hold two finite numbers, got {action}.")
+            raise ValueError(f"An action must hold two finite numbers, got {action!r}.")
         pressed = self.world.move(target, may_open=self._steps >= self._shut_steps)
         self._steps += 1
         if pressed is not None and self._attempts[-1:] != [pressed]:

@@ -26,7 +26,7 @@ def fan(
     start: tuple[float, float] = (0.5, 0.08),
     bend: float = 0.0,
 ) -> Tree:
-    """Ways that leave one fork at these angles, in degrees from straight on; each bends further half-way if asked to."""
+    """Ways that leave one fork at these angles, in degrees from straight on; each may bend further half-way."""
     nodes, parents, ends = [start, fork], [-1, 0], []
     for angle in map(math.radians, angles):
         legs = [(length, angle)]
