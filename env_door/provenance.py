@@ -5,10 +5,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from env_door.recording_config import RecordConfig
+from env_door.recording_config import DatasetConfig
 from env_door.staging import is_empty
 
-PROVENANCE_PATH = Path("meta/door_recording.json")
+PROVENANCE_PATH = Path("meta/door_recording.json")  # of all environments; the door was the first
 
 
 @dataclass
@@ -26,7 +26,7 @@ class Provenance:
         return max(used, default=self.settings["seed"] - 1) + 1
 
     @classmethod
-    def open(cls, config: RecordConfig) -> "Provenance":
+    def open(cls, config: DatasetConfig) -> "Provenance":
         """Read the provenance of the dataset to go on with, or start one."""
         root = config.path
         settings = json.loads(json.dumps(config.settings))
@@ -38,7 +38,7 @@ class Provenance:
             )
         if not (root / PROVENANCE_PATH).exists():
             raise ValueError(
-                f"{root} holds no recording of the door: {PROVENANCE_PATH} is missing. Choose another root."
+                f"{root} holds no recording that can go on: {PROVENANCE_PATH} is missing. Choose another root."
             )
         provenance = cls(**json.loads((root / PROVENANCE_PATH).read_text()))
         for name, value in settings.items():

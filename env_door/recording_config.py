@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from draccus.utils import ParsingError
 from huggingface_hub.utils import HFValidationError, validate_repo_id
@@ -37,7 +37,7 @@ class FrameEncoderConfig(RGBEncoderConfig):
 
 @dataclass
 class DatasetConfig:
-    """Where to record to, whatever the environment; its ways, such as kinds of door, are `kinds` in a subclass."""
+    """What to record, and where to, whatever the environment."""
 
     repo_id: str
     """Name of the dataset, {hf_username}/{dataset_name}."""
@@ -45,6 +45,8 @@ class DatasetConfig:
     """Folder of the dataset; by default $HF_LEROBOT_HOME/{repo_id}."""
     episodes_per_kind: int = 5
     """Episodes to save for each kind of door or way."""
+    kinds: list[str] = field(default_factory=list)
+    """Kinds of door or ways to record."""
     seed: int = 0
     """First seed; the following episodes count up from it."""
     matched: bool = True
@@ -59,9 +61,6 @@ class DatasetConfig:
     """Tags of the dataset on the Hub."""
     resume: bool = False
     """Go on with an interrupted recording, or extend a finished one."""
-
-    robot_type: ClassVar[str | None] = None
-    hint: ClassVar[str] = ""  # what may help an expert that keeps failing
 
     def __post_init__(self) -> None:
         wanted = "repo_id must read {hf_username}/{dataset_name}, for example my-name/door"
@@ -84,7 +83,17 @@ class DatasetConfig:
     @property
     def total_episodes(self) -> int:
         """Episodes of the complete dataset."""
-        return self.episodes_per_kind * len(self.kinds)  # type: ignore[attr-defined]
+        return self.episodes_per_kind * len(self.kinds)
+
+    @property
+    def robot_type(self) -> str | None:
+        """Name of the real robot whose joints these are, if there is one."""
+        return None
+
+    @property
+    def hint(self) -> str:
+        """What may help an expert that keeps failing."""
+        return ""
 
     @property
     def settings(self) -> dict[str, Any]:

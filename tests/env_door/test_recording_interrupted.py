@@ -225,7 +225,7 @@ def test_a_dataset_is_neither_overwritten_nor_resumed_with_other_settings(root, 
 def test_resuming_a_folder_that_is_no_recording_is_refused(root, expert):
     root.mkdir()
     (root / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="no recording of the door"):
+    with pytest.raises(ValueError, match="no recording that can go on"):
         record_door(root, resume=True)
     assert (root / "notes.txt").read_text() == "mine"
 
