@@ -1,4 +1,4 @@
-"""LeRobot's discovery hook: importing this module registers our policy, environment, robot and teleoperators.
+"""LeRobot's discovery hook: importing this module registers our policy, environments, robot and teleoperators.
 
 It imports configurations only; policy and processors, and with them PyTorch networks, come when they are asked for.
 """
@@ -6,6 +6,7 @@ It imports configurations only; policy and processors, and with them PyTorch net
 from typing import TYPE_CHECKING, Any
 
 from env_door.configuration_door import DoorEnvConfig
+from env_forks.configuration_forks import ForksEnvConfig
 from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
 from lerobot_ufrnn.robots.ur5e_robotiq import UR5eRobotiqConfig
 from lerobot_ufrnn.teleoperators import KeyboardTwistConfig, SpaceMouseTwistConfig
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DoorEnvConfig",
+    "ForksEnvConfig",
     "KeyboardTwistConfig",
     "SpaceMouseTwistConfig",
     "UFRNNConfig",

@@ -1,6 +1,5 @@
 """The door as a LeRobot environment: `--env.type=door`."""
 
-import multiprocessing
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -9,24 +8,16 @@ import gymnasium as gym
 from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import NEW_ROLLOUT_OPTION, _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from env_door.checks import check_range
 from env_door.latch import KINDS
 from env_door.limits import EPISODE_STEPS, FPS, IMAGE_SIZE, check_door
 from env_door.scene import ARMS
+from env_door.suites import WithoutRolloutOption, make_suites
 from env_door.trials import TrialLog
 
 TASKS = (*KINDS, "random", "all")
-
-
-class WithoutRolloutOption(gym.Wrapper):
-    """Keep LeRobot's own reset option from the environment, which refuses options that it does not know."""
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        own = {name: value for name, value in (options or {}).items() if name != NEW_ROLLOUT_OPTION}
-        return self.env.reset(seed=seed, options=own)
 
 
 def make_door(*, trial_log: str | None, **env_kwargs: Any) -> gym.Env:
@@ -96,23 +87,9 @@ class DoorEnvConfig(EnvConfig):
         return {name: getattr(self, name) for name in names} | {"max_episode_steps": self.episode_length}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
-        """Make the vector environments, one suite for each kind of door.
-
-        They are named `door_push`, `door_pull` and so on, because `lerobot-eval` reports its figures, names its videos
-        and labels its `per_group` results by suite. `use_async_envs` runs each environment in its own process.
-        """
-        suites: dict[str, dict[int, Any]] = {}
-        for kind in self.kinds:
-            make = partial(make_door, kind=kind, trial_log=self.trial_log, **self.gym_kwargs)
-            if use_async_envs and n_envs > 1:
-                # Imported once by the process that all others fork from, instead of by each of them: half a minute less
-                # for each kind of door. Python 3.12 does not preload the main script itself.
-                multiprocessing.set_forkserver_preload(["env_door.env", __name__, "lerobot.scripts.lerobot_eval"])
-                # Lazy: the processes of one kind start only when its turn has come.
-                envs = _LazyAsyncVectorEnv([make] * n_envs)
-            else:
-                # A finished environment stays frozen through NEXT_STEP's automatic reset and so costs nothing.
-                mode = gym.vector.AutoresetMode.NEXT_STEP
-                envs = gym.vector.SyncVectorEnv([freeze_after_episode_end(make)] * n_envs, autoreset_mode=mode)
-            suites[f"door_{kind}"] = {0: envs}
-        return suites
+        """Make the vector environments, one suite for each kind of door: `door_push`, `door_pull` and so on."""
+        makers = {
+            f"door_{kind}": partial(make_door, kind=kind, trial_log=self.trial_log, **self.gym_kwargs)
+            for kind in self.kinds
+        }
+        return make_suites(makers, n_envs, use_async_envs, preload=["env_door.env", __name__])

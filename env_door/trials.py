@@ -5,6 +5,7 @@ the first try or after a wrong one, is in the environment's `info` and would be 
 """
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,12 @@ class Trial:
     """What happened in one trial."""
 
     seed: int | None  # `None` when the environment was reset without one
-    door_kind: str
+    door_kind: str  # or in another environment what had to be found out
     success: bool
     steps: int  # control steps taken
     attempts: tuple[str, ...]  # directions in which the unlatched door was tried, in order
-    opening: float  # at the end: 0 closed, 1 the success threshold
-    door_offset: float  # sideways shift in m
+    opening: float = 0.0  # at the end: 0 closed, 1 the success threshold
+    door_offset: float = 0.0  # sideways shift in m
     held_at: int | None = None  # first control step, counted from 0, during which somebody held the door
     tried_while_held: tuple[str, ...] = ()  # directions other than its own tried meanwhile, in order
 
@@ -46,15 +47,33 @@ class Trial:
         return self.success and self.held_at is not None
 
 
+def describe_door(env: gym.Env, info: dict[str, Any]) -> dict[str, Any]:
+    """What a door and its last `info` tell of a trial."""
+    return {
+        "door_kind": info["door_kind"],
+        "attempts": tuple(info["attempts"]),
+        "opening": float(info["opening"]),
+        "door_offset": float(env.get_wrapper_attr("current_offset")),
+        "tried_while_held": tuple(info["tried_while_held"]),
+    }
+
+
 class TrialLog(gym.Wrapper):
     """Append one JSON line to a file for every trial that ends.
 
     A trial ends when the environment terminates or is truncated; one abandoned by an early reset leaves no line.
     Each line is a single write, so that parallel environments, also in other processes, may share the file.
+    `describe` gives those fields of a trial that depend on the environment.
     """
 
-    def __init__(self, env: gym.Env, path: str | Path):
+    def __init__(
+        self,
+        env: gym.Env,
+        path: str | Path,
+        describe: Callable[[gym.Env, dict[str, Any]], dict[str, Any]] = describe_door,
+    ):
         super().__init__(env)
+        self._describe = describe
         self._path = Path(path)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._seed: int | None = None
@@ -71,20 +90,16 @@ class TrialLog(gym.Wrapper):
         """Step the environment and log the trial when this step ends it."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps += 1
-        if info["held"] and self._held_at is None:
+        if info.get("held") and self._held_at is None:
             self._held_at = self._steps
         if (terminated or truncated) and not self._finished:
             self._finished = True
             trial = Trial(
                 seed=self._seed,
-                door_kind=info["door_kind"],
                 success=bool(info["is_success"]),
                 steps=self._steps,
-                attempts=tuple(info["attempts"]),
-                opening=float(info["opening"]),
-                door_offset=float(self.get_wrapper_attr("current_offset")),
                 held_at=self._held_at,
-                tried_while_held=tuple(info["tried_while_held"]),
+                **self._describe(self.env, info),
             )
             append_trial(self._path, trial)
         return observation, reward, terminated, truncated, info
@@ -128,4 +143,5 @@ def read_trials(path: str | Path) -> list[Trial]:
 def first_of_each_kind(trials: list[Trial], count: int) -> list[Trial]:
     """Of each kind the trials that `lerobot-eval` counts, those with the lowest seeds: its last batch may hold more."""
     ordered = sorted(trials, key=lambda trial: trial.seed or 0)
-    return [trial for kind in KINDS for trial in [t for t in ordered if t.door_kind == kind][:count]]
+    kinds = dict.fromkeys((*KINDS, *(trial.door_kind for trial in trials)))
+    return [trial for kind in kinds for trial in [t for t in ordered if t.door_kind == kind][:count]]

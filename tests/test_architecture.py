@@ -8,7 +8,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 POLICY = ROOT / "lerobot_ufrnn"
 
-files_of = {name: sorted((ROOT / name).rglob("*.py")) for name in ("env_door", "lerobot_ufrnn", "experiments")}
+PARTS = ("env_door", "env_forks", "lerobot_ufrnn", "experiments")
+
+files_of = {name: sorted((ROOT / name).rglob("*.py")) for name in PARTS}
 
 
 def imported_modules(file: Path) -> set[str]:
@@ -29,6 +31,11 @@ def packages(file: Path) -> set[str]:
 
 @pytest.mark.parametrize("file", files_of["env_door"], ids=lambda file: file.stem)
 def test_the_door_knows_nothing_of_learning(file):
+    assert not packages(file) & {"lerobot_ufrnn", "torch", "env_forks"}
+
+
+@pytest.mark.parametrize("file", files_of["env_forks"], ids=lambda file: file.stem)
+def test_the_ambiguous_tasks_know_nothing_of_learning(file):
     assert not packages(file) & {"lerobot_ufrnn", "torch"}
 
 
@@ -37,7 +44,8 @@ def test_the_policy_knows_the_door_only_where_a_command_joins_them(file):
     allowed = {"env_door.checks", "env_door.kinematics", "env_door.scene"}  # neither simulator nor learning in them
     if file.parent == POLICY / "commands" or file == POLICY / "analysis" / "results.py":
         return
-    assert not {name for name in imported_modules(file) if name.split(".")[0] == "env_door"} - allowed
+    found = {name for name in imported_modules(file) if name.split(".")[0] in ("env_door", "env_forks")}
+    assert not found - allowed
 
 
 @pytest.mark.parametrize("file", sorted((POLICY / "networks").glob("*.py")), ids=lambda file: file.stem)
@@ -47,7 +55,7 @@ def test_the_networks_do_not_know_lerobot(file):
 
 def test_what_is_installed_does_not_know_the_experiments():
     scripts = {file.stem for file in files_of["experiments"]} | {"experiments"}
-    for file in (*files_of["env_door"], *files_of["lerobot_ufrnn"]):
+    for file in (*files_of["env_door"], *files_of["env_forks"], *files_of["lerobot_ufrnn"]):
         assert not packages(file) & scripts, file
 
 

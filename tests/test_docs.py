@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from env_door.configuration_door import DoorEnvConfig
+from env_forks.configuration_forks import ForksEnvConfig
 from lerobot_ufrnn.commands import COMMANDS
 from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
 from lerobot_ufrnn.robots.ur5e_robotiq import UR5eRobotiqConfig
@@ -28,11 +29,11 @@ IN_REPOSITORY = (
     f"{REPOSITORY}/blob/main/",
     f"{REPOSITORY.replace('//github.com', '//raw.githubusercontent.com')}/main/",
 )
-FOLDERS = "lerobot_ufrnn|env_door|experiments|configs|docs|scripts|tests"
+FOLDERS = "lerobot_ufrnn|env_door|env_forks|experiments|configs|docs|scripts|tests"
 
 
 OTHERS = {
-    "env": (DoorEnvConfig,),
+    "env": (DoorEnvConfig, ForksEnvConfig),
     "robot": (UR5eRobotiqConfig,),
     "teleop": (KeyboardTwistConfig, SpaceMouseTwistConfig),
 }
@@ -122,7 +123,9 @@ def test_repository_is_the_one_of_the_package():
 
 @pytest.mark.parametrize("path", [*TODAY, *CONFIGS], ids=by_name)
 def test_files_that_are_named_exist(path: Path):
-    text = path.read_text().replace("env_door/Door-v0", "")  # the environment's name in Gymnasium's registry
+    text = path.read_text()
+    for environment in ("env_door/Door-v0", "env_forks/Forks-v0"):  # names in Gymnasium's registry
+        text = text.replace(environment, "")
     for name in re.findall(rf"(?<![\w/.])(?:{FOLDERS})/[\w./-]*\w", text):
         assert (ROOT / name).exists(), f"there is no {name}"
 

@@ -29,17 +29,18 @@ variables, before, filters = dict(os.environ), logs(), list(warnings.filters)
 import lerobot_policy_ufrnn as plugin
 assert dict(os.environ) == variables, set(os.environ.items()) ^ set(variables.items())
 assert logs() == before, (logs(), before)
-heavy = {"mujoco", "glfw", "OpenGL", "numba", "rtde_control", "lerobot_ufrnn.modeling_ufrnn", "env_door.env"}
+heavy = {"mujoco", "glfw", "OpenGL", "numba", "rtde_control"}
+heavy |= {"lerobot_ufrnn.modeling_ufrnn", "env_door.env", "env_forks.env"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.robots import RobotConfig
 from lerobot.teleoperators import TeleoperatorConfig
-assert "ufrnn" in PreTrainedConfig.get_known_choices() and "door" in EnvConfig.get_known_choices()
+assert "ufrnn" in PreTrainedConfig.get_known_choices() and {"door", "forks"} <= set(EnvConfig.get_known_choices())
 assert "ur5e_robotiq" in RobotConfig.get_known_choices()
 assert {"spacemouse_twist", "keyboard_twist"} <= set(TeleoperatorConfig.get_known_choices())
-plugin.DoorEnvConfig(), plugin.UFRNNConfig()
+plugin.DoorEnvConfig(), plugin.ForksEnvConfig(), plugin.UFRNNConfig()
 import gymnasium, env_door, env_door.kinematics, env_door.scene, env_door.trials
 assert gymnasium.spec("env_door/Door-v0").entry_point == "env_door.env:DoorEnv"
 assert "mujoco" not in sys.modules
