@@ -117,7 +117,7 @@ class ForksEnv(gym.Env):
         self._steps = 0
         self._attempts: list[int] = []
         self._arrived = self._failed = self._done = False
-        self._seen: deque[dict[str, Any]] = deque(maxlen=task.delay + 1)
+        self._seen: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=task.delay + 1)
         return self._observe(), self._info()
 
     def step(self, action: ArrayLike):
@@ -156,8 +156,9 @@ class ForksEnv(gym.Env):
         measured = self.world.measured
         if self.task.noise:
             measured = measured + self.np_random.normal(0, self.task.noise, 2)
-        self._seen.append({"agent_pos": measured.astype(np.float32), "pixels": {"front": self._draw(self._picture)}})
-        return self._seen[0]
+        self._seen.append((measured.astype(np.float32), self._draw(self._picture)))
+        position, picture = self._seen[0]
+        return {"agent_pos": position.copy(), "pixels": {"front": picture.copy()}}
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self._done, "attempts": tuple(self._attempts), "way": self.current_way}
