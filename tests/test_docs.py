@@ -15,6 +15,7 @@ import yaml
 
 from env_door.configuration_door import DoorEnvConfig
 from env_forks.configuration_forks import ForksEnvConfig
+from env_forks.tasks import TASKS
 from lerobot_ufrnn.commands import COMMANDS
 from lerobot_ufrnn.configuration_ufrnn import UFRNNConfig
 from lerobot_ufrnn.robots.ur5e_robotiq import UR5eRobotiqConfig
@@ -174,6 +175,11 @@ def test_flags_have_the_defaults_that_usage_says():
     for name, text in table:
         value = yaml.safe_load(text)
         assert (tuple(value) if isinstance(value, list) else value) == defaults[name], name
+
+
+def test_usage_has_every_ambiguous_task():
+    rows = re.findall(r"^\| `(\w+)` \| (\d+) \| (.+) \|$", (ROOT / "docs/usage.md").read_text(), re.MULTILINE)
+    assert rows == [(task.name, str(len(task.ways)), task.special) for task in TASKS.values()]
 
 
 def test_changelog_has_the_new_name_of_every_field_in_a_group():

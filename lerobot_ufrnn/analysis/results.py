@@ -87,7 +87,7 @@ def _rates(counts: pd.DataFrame, columns: dict[str, tuple[str, str]]) -> pd.Data
         heading: [format_rate(*row) for row in counts[[part, whole]].itertuples(index=False)]
         for heading, (part, whole) in columns.items()
     }
-    return pd.DataFrame(rates, index=counts.index.rename("door"))
+    return pd.DataFrame(rates, index=counts.index.rename("kind"))
 
 
 def markdown(table: pd.DataFrame) -> str:
