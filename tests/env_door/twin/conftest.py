@@ -7,8 +7,7 @@ import struct
 import pytest
 
 from env_door.twin import free_address, ports
-from env_door.twin.configuration import TwinConfig
-from env_door.twin.server import Twin
+from env_door.twin.server import Twin, TwinConfig
 
 
 class TurnedTwin(Twin):

@@ -45,9 +45,9 @@ def recover(twin, dashboard):
     wait_until(lambda: unlocked(dashboard))
     if twin.state()["robot_mode"] != "RUNNING":
         dashboard.powerOn()
-        twin.wait_for(robot_mode="IDLE")
+        wait_until(lambda: twin.state()["robot_mode"] == "IDLE")
         dashboard.brakeRelease()
-        twin.wait_for(robot_mode="RUNNING")
+        wait_until(lambda: twin.state()["robot_mode"] == "RUNNING")
     dashboard.stop()
 
 
@@ -162,7 +162,7 @@ def test_disconnecting_and_connecting_again(twin, control, receive):
     control.disconnect()
     receive.disconnect()
     assert not receive.isConnected()
-    twin.wait_for(rtde_clients=0)
+    wait_until(lambda: twin.state()["rtde_clients"] == 0)
     assert receive.reconnect()
     assert control.reconnect()
     assert servo(control, receive, [0.05, 0, 0, 0, 0, 0], 0.2)
@@ -258,8 +258,8 @@ def test_local_control_refuses_a_new_client(twin):
 
 
 def test_a_twin_tells_when_its_address_is_taken(running):
-    with pytest.raises(TwinError, match="another twin"):
-        TwinProcess(address=running.address).start()
+    with pytest.raises(TwinError, match="another twin"), TwinProcess(address=running.address):
+        pass
 
 
 def test_nobody_there():
@@ -270,7 +270,7 @@ def test_nobody_there():
 def test_it_dies_with_its_parent():
     code = (
         "import time; from env_door.twin import TwinProcess\n"
-        f"with TwinProcess(address={free_address()!r}) as twin: print(twin.pid, flush=True); time.sleep(60)"
+        f"with TwinProcess(address={free_address()!r}) as twin: print(twin.process.pid, flush=True); time.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     pid = int(parent.stdout.readline())

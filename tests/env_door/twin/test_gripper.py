@@ -127,9 +127,9 @@ def test_the_socket_takes_split_and_joined_lines_and_can_be_made_to_fail(twin, c
     client.put(b"OS\nGET STA\n")
     client.turn()
     assert client.take() == "POS 3\nSTA 0\n"
-    twin.injections.start("gripper_garbage")
+    twin.inject("gripper_garbage")
     garbage = client.ask("GET POS")
     assert garbage
     assert not garbage.startswith("POS")
-    twin.injections.start("gripper_silent")
+    twin.inject("gripper_silent")
     assert client.ask("GET POS") == ""
