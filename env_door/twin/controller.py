@@ -71,7 +71,6 @@ class Controller:
         self._program_starts = 0.0
         self._switching_ends = math.inf
         self._ticks = 0
-        self.gripper.switch_on(0.0)
         self.settle()
 
     @property

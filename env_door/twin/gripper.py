@@ -31,6 +31,7 @@ class GripperModel:
         self.silent = self.garbage = False  # whether the socket answers nothing, or nonsense
         self._cause = 0  # a fault that comes back with every activation; 0 for none
         self.switch_off()
+        self.switch_on(0.0)
 
     def switch_off(self) -> None:
         """Takes its power away: afterwards it must be activated."""

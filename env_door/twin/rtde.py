@@ -55,6 +55,7 @@ INPUTS = _by_name(
 )
 INPUTS = {name: kind for name, kind in INPUTS.items() if not name.startswith("output_")}
 
+POWERED = (RobotMode.IDLE, RobotMode.RUNNING)
 JOINT_MODES = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255, RobotMode.BOOTING: 247, RobotMode.POWER_OFF: 239}
 SAFETY_BITS = {
     SafetyMode.NORMAL: 1 << 0,
@@ -86,7 +87,8 @@ class RTDEServer:
                 body = await reader.readexactly(size - HEADER.size)
                 while self.frozen:
                     await asyncio.sleep(TIME_STEP)
-                session.handle(chr(kind), body)
+                if not writer.is_closing():
+                    session.handle(chr(kind), body)
         except (struct.error, ValueError) as error:
             logger.warning("RTDE client sent a malformed package (%s): hung up", error)
         finally:
@@ -125,15 +127,13 @@ class RTDEServer:
             "speed_scaling": lambda: (float(controller.may_move),),
             "target_speed_fraction": lambda: (1.0,),
             "runtime_state": lambda: (controller.program_state,),
-            "robot_status_bits": self._status_bits,
+            "robot_status_bits": lambda: (
+                (controller.robot_mode in POWERED) | (controller.program_state == ProgramState.PLAYING) << 1,
+            ),
             "safety_status_bits": lambda: (SAFETY_BITS[controller.safety_mode],),
         }
         zeros = (0,) * _count(OUTPUTS[name])
         return known.get(name, lambda: zeros)
-
-    def _status_bits(self) -> tuple[int]:
-        powered = self.controller.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING)
-        return (powered | (self.controller.program_state == ProgramState.PLAYING) << 1,)
 
 
 class RTDESession:

@@ -49,7 +49,6 @@ class UploadedScript:
         self._controller, self._motion, self._registers = controller, controller.motion, controller.registers
         self._offset = int(match[1]) if (match := _OFFSET.search(source)) else 0
         self._async_writes = self._async_operations = 0
-        self._async_moving = False
 
     def run(self) -> Iterator[None]:
         """The script's main loop; a ScriptError ends it."""
@@ -75,8 +74,7 @@ class UploadedScript:
         controller, motion, door = self._controller, self._motion, self._controller.door
         match command:
             case 1:  # movej
-                self._refuse_during("servo", "servoStop")
-                self._end_async_move()
+                self._take_over()
                 motion.move(self._joint_arguments(), speed=self._argument(6), acceleration=self._argument(7))
                 yield from self._until_still_unless_async()
             case 8 | 17:  # zero_ftsensor, set_payload
@@ -95,8 +93,7 @@ class UploadedScript:
                 controller.protective_stop("asked for by the client")
                 yield  # the program is paused right here, before it could answer
             case 33 | 34:  # stopl, stopj
-                self._refuse_during("servo", "servoStop")
-                self._end_async_move()
+                self._take_over()
                 motion.stop(self._argument(0))
                 yield from self._until_still_unless_async()
             case 35:  # set_watchdog
@@ -134,6 +131,10 @@ class UploadedScript:
         for index, value in enumerate(values):
             self._registers[f"output_double_register_{self._offset + index}"] = float(value)
 
+    def _take_over(self) -> None:
+        self._refuse_during("servo", "servoStop")
+        self._end_async_move()
+
     def _refuse_during(self, kind: str, stop: str) -> None:
         if self._motion.kind == kind:
             raise ScriptError(f"another thread is already controlling the robot: {stop} first")
@@ -145,17 +146,16 @@ class UploadedScript:
     def _until_still_unless_async(self) -> Iterator[None]:
         if self._integer(1) == 1:
             self._signal_async(running=True)
-            self._async_moving = True
         else:
             yield from self._until_still()
 
     def _end_async_move(self) -> None:
-        if self._async_moving:
-            self._async_moving = False
+        if self._async_running:
             self._signal_async(running=False)
 
     def _signal_async(self, running: bool) -> None:
         # Output register 2: counters of writes and operations, and whether one runs (bit 15); how far it is stays 0.
+        self._async_running = running
         self._async_writes = (self._async_writes + 1) % 128
         self._async_operations = (self._async_operations + running) % 128
         self._answer(2, self._async_writes << 16 | self._async_operations << 24 | running << 15)
