@@ -22,10 +22,8 @@ async def main() -> None:
         config = draccus.parse(TwinConfig)
         twin = Twin(config)
         await twin.open()
-    except ParsingError as error:
+    except (ParsingError, ValueError, OSError, ModuleNotFoundError, RuntimeError) as error:
         sys.exit(f"env_door.twin: {error.__cause__ or error}")  # draccus wraps what the configuration says
-    except (ValueError, OSError, ModuleNotFoundError, RuntimeError) as error:
-        sys.exit(f"env_door.twin: {error}")
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, twin.stopped.set)

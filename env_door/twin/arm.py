@@ -110,10 +110,6 @@ class LiveDoor(DoorEnv):
         self._base, self._flange = (int(self.model.body(name).id) for name in ("base", "flange"))
         self.joint_low, self.joint_high = self._low[:-1], self._high[:-1]
 
-    def place(self, seed: int, kind: str | None = None) -> None:
-        """Starts a trial with a door of some kind, or of the one configured."""
-        self.reset(seed=seed, options={} if kind is None else {"kind": kind})
-
     def _observation(self) -> dict[str, Any]:
         # The camera is a process of its own: `reset` would draw here only to throw the picture away.
         return {}

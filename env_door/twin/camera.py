@@ -125,7 +125,7 @@ def _run(endpoint: str, mode: Any, drawn: Any, scene: Any, answer: Any) -> None:
             if socket.closed:
                 socket = _bind(context, endpoint)
             else:
-                socket.close(linger=0)
+                socket.close()
                 watched = False
         while not socket.closed and socket.poll(0):
             watched = socket.recv()[:1] == b"\x01"

@@ -158,15 +158,11 @@ class Controller:
             self.safety_mode = SafetyMode.NORMAL
         return True
 
-    def press_emergency_stop(self) -> None:
-        """Emergency stop: the program ends, brakes close and the arm loses its power."""
-        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
-        self.power_off()
-
-    def release_emergency_stop(self) -> None:
-        """Pulls the button out again; the arm stays without power until somebody switches it on."""
-        if self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
-            self.safety_mode = SafetyMode.NORMAL
+    def emergency_stop(self, pressed: bool) -> None:
+        """Presses the button, which takes the arm's power away, or pulls it out again; the arm stays without power."""
+        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP if pressed else SafetyMode.NORMAL
+        if pressed:
+            self.power_off()
 
     def power_off(self) -> None:
         """Takes the arm's power away: the program ends and brakes close."""

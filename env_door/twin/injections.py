@@ -40,8 +40,8 @@ def _port_gone(port: int) -> Injection:
 
 def _flag(path: str, broken: bool) -> Injection:
     owner, name = path.rsplit(".", 1)
-    find = attrgetter(owner)
-    return Injection(lambda twin: setattr(find(twin), name, broken), lambda twin: setattr(find(twin), name, not broken))
+    of = attrgetter(owner)
+    return Injection(lambda twin: setattr(of(twin), name, broken), lambda twin: setattr(of(twin), name, not broken))
 
 
 def _camera_mode(mode: int) -> Injection:
@@ -83,7 +83,7 @@ INJECTIONS = {
     "camera_black": _camera_mode(camera.BLACK),
     "camera_gone": _camera_mode(camera.GONE),
     "emergency_stop": Injection(
-        lambda twin: twin.controller.press_emergency_stop(), lambda twin: twin.controller.release_emergency_stop()
+        lambda twin: twin.controller.emergency_stop(True), lambda twin: twin.controller.emergency_stop(False)
     ),
     "power_off": Injection(lambda twin: twin.controller.power_off(), "'power on' and 'brake release' on the dashboard"),
     "protective_stop": Injection(

@@ -35,7 +35,7 @@ class Port:
             if error.errno == errno.EADDRINUSE:
                 advice = "another twin or a robot's simulator may run there; end it, or choose another address"
             message = f"cannot listen on {self._address}:{self._number} ({error}): {advice} such as 127.0.0.3"
-            raise OSError(error.errno, message) from error
+            raise OSError(error.errno, message) from None
 
     def shut(self) -> None:
         """Ends all connections and refuses new ones, until it is opened again."""

@@ -187,6 +187,7 @@ class RTDESession:
         types = [OUTPUTS.get(name, "NOT_FOUND") for name in names]
         known = "NOT_FOUND" not in types and bool(names) and 1 <= frequency <= 1 / TIME_STEP
         self._readings = [self._server.reading(name) for name in names] if known else []
+        self._started &= known
         if known:
             self._every = max(1, round(1 / (TIME_STEP * frequency)))
             self._format = struct.Struct(">B" + "".join(FORMATS[one] for one in types))

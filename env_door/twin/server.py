@@ -67,7 +67,7 @@ class Twin:
         self._lost = 0.0
         self._trial_start = 0.0
         self.door = LiveDoor(config.kind, config.door_offset, config.hold_seconds)
-        self.door.place(config.seed)
+        self.door.reset(seed=config.seed)
         self.controller: Controller = Controller(self.door, config.unlock_seconds)
         self.rtde: RTDEServer = RTDEServer(self.controller)
         self.camera = Camera(config.address, self.door.model.nq) if config.camera else None
@@ -129,7 +129,6 @@ class Twin:
     def state(self) -> dict[str, Any]:
         """What is the case, whatever clients are told; see [`~env_door.twin.TwinClient.state`]."""
         latch, controller = self.door.latch, self.controller
-        joints = np.append(self.door.joints, self.door.closure)
         targets = np.append(controller.motion.position, controller.gripper.target)
         return {
             "kind": latch.kind,
@@ -141,7 +140,7 @@ class Twin:
             "seed": self._seed,
             "time": controller.time - self._trial_start,
             "controller_time": controller.time,
-            "joints": dict(zip(self.door.joint_names, joints.tolist(), strict=True)),
+            "joints": dict(zip(self.door.joint_names, self.door.measured_joints().tolist(), strict=True)),
             "targets": dict(zip(self.door.joint_names, targets.tolist(), strict=True)),
             "arm_speed": float(np.abs(self.door.joint_speeds).max()),
             "motion": controller.motion.kind,
@@ -160,7 +159,7 @@ class Twin:
         seed = self._seed + 1 if seed is None else seed
         if not isinstance(seed, int) or seed < 0:
             raise ValueError(f"seed={seed!r} must be a whole number that is not negative")
-        self.door.place(seed, kind)
+        self.door.reset(seed=seed, options={} if kind is None else {"kind": kind})
         self._seed = seed
         self._trial_start = self.controller.time
         self.controller.gripper.open_at_once()
