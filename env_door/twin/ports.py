@@ -34,8 +34,8 @@ class Port:
             advice = "choose an address of this machine"
             if error.errno == errno.EADDRINUSE:
                 advice = "another twin or a robot's simulator may run there; end it, or choose another address"
-            message = f"cannot listen on {self._address}:{self._number} ({error}): {advice} such as 127.0.0.3"
-            raise OSError(error.errno, message) from None
+            where, why = f"{self._address}:{self._number}", error.strerror or error
+            raise OSError(f"cannot listen on {where} ({why}): {advice} such as 127.0.0.3") from None
 
     def shut(self) -> None:
         """Ends all connections and refuses new ones, until it is opened again."""
