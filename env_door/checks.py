@@ -1,6 +1,10 @@
-"""One way to refuse a field of a configuration: what was given, and what is allowed."""
+"""One way to refuse a field of a configuration: what was given, and what is allowed.
+
+All raise a ParsingError, as the parser of LeRobot's command lines hides the text of a ValueError.
+"""
 
 import math
+import operator
 from collections.abc import Iterable
 
 from draccus.utils import ParsingError
@@ -17,33 +21,16 @@ def check_range(
 ) -> None:
     """Refuses fields out of their range. A field of several numbers is checked one by one; none may be NaN or infinite.
 
-    Args:
-        config (`object`):
-            A configuration.
-        *names (`str`):
-            Its fields.
-        low (`float`, *optional*), high (`float`, *optional*):
-            Smallest and largest value allowed.
-        above (`float`, *optional*), below (`float`, *optional*):
-            Bounds that are not allowed themselves.
-        unit (`str`, *optional*, defaults to `""`):
-            Unit of the bounds, for the message.
-
-    Raises:
-        ParsingError: If a value is out of range (the parser of LeRobot's command lines hides a ValueError's text).
+    `low` and `high` are allowed themselves, `above` and `below` are not; `unit` is theirs, for the message.
     """
-    bounds = {"at least": low, "at most": high, "above": above, "below": below}
-    allowed = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if bound is not None) or "finite"
+    words = {"at least": operator.ge, "at most": operator.le, "above": operator.gt, "below": operator.lt}
+    given = zip(words, (low, high, above, below), strict=True)
+    bounds = {word: bound for word, bound in given if bound is not None}
+    allowed = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items()) or "finite"
     for name in names:
         value = getattr(config, name)
         for number in value if isinstance(value, Iterable) else (value,):
-            if not (
-                math.isfinite(number)
-                and (low is None or number >= low)
-                and (high is None or number <= high)
-                and (above is None or number > above)
-                and (below is None or number < below)
-            ):
+            if not (math.isfinite(number) and all(words[word](number, bound) for word, bound in bounds.items())):
                 raise ParsingError(
                     f"`{name}` must be {allowed}{unit and ' ' + unit}, got {value} ({type(config).__name__})."
                 )

@@ -25,7 +25,6 @@ class WithoutRolloutOption(gym.Wrapper):
     """Keep LeRobot's own reset option from the environment, which refuses options that it does not know."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Reset with all the options but LeRobot's."""
         own = {name: value for name, value in (options or {}).items() if name != NEW_ROLLOUT_OPTION}
         return self.env.reset(seed=seed, options=own)
 
@@ -39,34 +38,27 @@ def make_door(*, trial_log: str | None, **env_kwargs: Any) -> gym.Env:
 @EnvConfig.register_subclass("door")
 @dataclass
 class DoorEnvConfig(EnvConfig):
-    """Configuration of the door environment for `lerobot-eval` and `lerobot-train`.
-
-    Args:
-        task (`str`, *optional*, defaults to `"all"`):
-            Kind of door: `"push"`, `"pull"`, `"slide"` or `"random"` (drawn at each reset). Several kinds, such as
-            `"push,pull"` or `"all"` for the three of them, are evaluated one after the other, each reported by itself.
-        fps (`int`, *optional*, defaults to 10):
-            Control steps a second. The environment runs at 10 Hz only.
-        episode_length (`int`, *optional*, defaults to 300):
-            Steps after which a trial is cut.
-        arm, door_offset, start_variation, command_limit, hold_seconds:
-            As in [`~env_door.env.DoorEnv`].
-        trial_log (`str | None`, *optional*):
-            File that gets one JSON line for every finished trial, see [`~env_door.trials.read_trials`].
-
-    Raises:
-        ParsingError: If a field is out of its range.
-    """
+    """Configuration of the door environment for `lerobot-eval` and `lerobot-train`."""
 
     task: str | None = "all"
+    """Kind of door: push, pull, slide or random (drawn at each reset). Several, such as push,pull or all, are evaluated
+    one after the other, each reported by itself."""
     fps: int = FPS
+    """Control steps a second; the environment runs at no other rate."""
     episode_length: int = EPISODE_STEPS
+    """Steps after which a trial is cut."""
     arm: str = "ur5e"
+    """ur5e or panda."""
     door_offset: float = 0.0
+    """Half-width in m of the range of the door's sideways shift."""
     start_variation: float = 0.02
+    """Half-width in m of the range of the tool's start position along each axis."""
     command_limit: float = 0.08
+    """Largest distance in rad of a command from the measured joints."""
     hold_seconds: float = 0.0
+    """For how long somebody holds the door still once it has begun to open."""
     trial_log: str | None = None
+    """File that gets one JSON line for every finished trial."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "pixels/front": f"{OBS_IMAGES}.front"}
@@ -93,16 +85,6 @@ class DoorEnvConfig(EnvConfig):
         }
 
     @property
-    def package_name(self) -> str:
-        """Package that registers the environment."""
-        return "env_door"
-
-    @property
-    def gym_id(self) -> str:
-        """Id of the environment in Gymnasium's registry; the task is a keyword of it, not part of its name."""
-        return "env_door/Door-v0"
-
-    @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of door, one suite each."""
         return KINDS if self.task == "all" else tuple(kind.strip() for kind in str(self.task).split(","))
@@ -110,16 +92,8 @@ class DoorEnvConfig(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Keywords of `gym.make`, but for the kind of the door."""
-        return {
-            "arm": self.arm,
-            "door_offset": self.door_offset,
-            "start_variation": self.start_variation,
-            "command_limit": self.command_limit,
-            "hold_seconds": self.hold_seconds,
-            "observation_size": IMAGE_SIZE,
-            "max_episode_steps": self.episode_length,
-            "disable_env_checker": self.disable_env_checker,
-        }
+        names = ("arm", "door_offset", "start_variation", "command_limit", "hold_seconds", "disable_env_checker")
+        return {name: getattr(self, name) for name in names} | {"max_episode_steps": self.episode_length}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """Make the vector environments, one suite for each kind of door.
@@ -135,13 +109,10 @@ class DoorEnvConfig(EnvConfig):
                 # for each kind of door. Python 3.12 does not preload the main script itself.
                 multiprocessing.set_forkserver_preload(["env_door.env", __name__, "lerobot.scripts.lerobot_eval"])
                 # Lazy: the processes of one kind start only when its turn has come.
-                suites[f"door_{kind}"] = {0: _LazyAsyncVectorEnv([make] * n_envs)}
-                continue
-            # A finished environment stays frozen through NEXT_STEP's automatic reset and so costs nothing.
-            suites[f"door_{kind}"] = {
-                0: gym.vector.SyncVectorEnv(
-                    [freeze_after_episode_end(make)] * n_envs,
-                    autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP,
-                )
-            }
+                envs = _LazyAsyncVectorEnv([make] * n_envs)
+            else:
+                # A finished environment stays frozen through NEXT_STEP's automatic reset and so costs nothing.
+                mode = gym.vector.AutoresetMode.NEXT_STEP
+                envs = gym.vector.SyncVectorEnv([freeze_after_episode_end(make)] * n_envs, autoreset_mode=mode)
+            suites[f"door_{kind}"] = {0: envs}
         return suites

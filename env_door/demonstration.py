@@ -22,10 +22,8 @@ class Demonstration:
     images: np.ndarray  # (T, H, W, 3), uint8
     states: np.ndarray  # (T, D), measured joints in rad, the gripper last in 0..1
     actions: np.ndarray  # (T, D), joint targets applied at the frame of the same index
-    branch_step: int
-    """First step whose action depends on the kind."""
-    success_step: int
-    """First step after which the door counted as open."""
+    branch_step: int  # first step whose action depends on the kind
+    success_step: int  # first step after which the door counted as open
 
 
 def spread(seed: int) -> float:
@@ -40,27 +38,10 @@ def spread(seed: int) -> float:
 def demonstrate(
     env: DoorEnv, kind: str, seed: int, num_steps: int, door_offset: float | None = None
 ) -> Demonstration | None:
-    """Let the expert open a door, and go on holding it open to the last step.
+    """Let the expert open a door and hold it open to the last step; `None` if it opens too late or is out of reach.
 
-    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`.
-
-    Args:
-        env (`DoorEnv`):
-            Environment without a time limit.
-        kind (`str`):
-            Kind of the door, which is also the direction that the expert tries.
-        seed (`int`):
-            Seed of the environment and of the expert's timing.
-        num_steps (`int`):
-            Length of the demonstration.
-        door_offset (`float`, *optional*):
-            Where the door stands, in m; drawn by the environment if it is not given.
-
-    Returns:
-        `Demonstration | None`: `None` when the door did not open in time or was out of reach.
-
-    Raises:
-        ValueError: If `num_steps` ends before the expert would have tried the door.
+    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`. Without
+    a `door_offset` in m the environment draws where the door stands.
     """
     options = {"kind": kind} if door_offset is None else {"kind": kind, "door_offset": door_offset}
     observation, _ = env.reset(seed=seed, options=options)

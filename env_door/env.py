@@ -18,15 +18,11 @@ from env_door.rendering import Renderer, make_renderer
 from env_door.scene import ARMS, GRIPPER_STROKE, load_model
 from env_door.simulator import mujoco
 
-CONTROL_STEPS = 50
-"""Physics steps of 2 ms in one control step of 0.1 s."""
-
+CONTROL_STEPS = 50  # physics steps of 2 ms in one control step of 0.1 s
 HOLD_OPENING = 0.15
 """Opening, as a fraction of what counts as open, at which somebody holds the door: 60 mrad or 21 mm, seen to move."""
 
-START_DISTANCE = 0.16
-"""Distance in metres between the tool and the knob at the nominal start."""
-
+START_DISTANCE = 0.16  # in m between the tool and the knob at the nominal start
 GRIPPER_SPEED = 1.76
 """Largest change of the gripper target per second in units of its stroke (Robotiq 2F-85: 150 mm/s)."""
 
@@ -81,31 +77,21 @@ class DoorEnv(gym.Env):
 
     ## Arguments
 
-    Args:
-        kind (`str`, *optional*, defaults to `"random"`):
-            `"push"`, `"pull"`, `"slide"`, or `"random"` for a draw at every reset.
-        arm (`str`, *optional*, defaults to `"ur5e"`):
-            `"ur5e"` (6 joints) or `"panda"` (7 joints).
-        door_offset (`float`, *optional*, defaults to `0.0`):
-            Half-width in m, 0 to 0.05, of the range from which the door's sideways shift is drawn at every
-            reset.
-        start_variation (`float`, *optional*, defaults to `0.02`):
-            Half-width in m, 0 to 0.05, of the range of the tool's start position along each axis.
-        command_limit (`float`, *optional*, defaults to `0.08`):
-            Largest distance in rad, 0.01 to 1, between a joint target and the measured joint; keeps a blocked arm from
-            folding up.
-        hold_seconds (`float`, *optional*, defaults to `0.0`):
-            Seconds, 0 to 60, for which somebody on the other side holds the door still, once in a trial: from the
-            first control step that leaves it at least 15 % open. 0 lets the door be.
-        observation_size (`int`, *optional*, defaults to `128`):
-            Height and width of the observed image in pixels, 16 to 768.
-        render_size (`int`, *optional*, defaults to `192`):
-            Height and width of the picture that `render` returns, 16 to 768.
-        render_mode (`str`, *optional*, defaults to `"rgb_array"`):
-            Only `"rgb_array"`.
+    | Argument           | Default       | What                                                                     |
+    |--------------------|---------------|--------------------------------------------------------------------------|
+    | `kind`             | `"random"`    | `"push"`, `"pull"`, `"slide"`, or `"random"`: drawn at every reset       |
+    | `arm`              | `"ur5e"`      | `"ur5e"` (6 joints) or `"panda"` (7 joints)                              |
+    | `door_offset`      | `0.0`         | half-width in m, 0 to 0.05, of the range of the door's sideways shift    |
+    | `start_variation`  | `0.02`        | half-width in m, 0 to 0.05, of the tool's start position along each axis |
+    | `command_limit`    | `0.08`        | largest distance in rad, 0.01 to 1, of a joint target from the measured  |
+    |                    |               | joint; keeps a blocked arm from folding up                               |
+    | `hold_seconds`     | `0.0`         | seconds, 0 to 60, for which somebody holds the door still, once in a     |
+    |                    |               | trial: from the first step that leaves it at least 15 % open             |
+    | `observation_size` | `128`         | height and width of the observed image in pixels, 16 to 768              |
+    | `render_size`      | `192`         | the same of the picture that `render` returns                            |
+    | `render_mode`      | `"rgb_array"` | nothing else                                                             |
 
-    Raises:
-        ValueError: If an argument is out of its range.
+    Another value is a ValueError.
 
     ## Version History
 
@@ -128,7 +114,7 @@ class DoorEnv(gym.Env):
         render_size: int = 192,
         render_mode: str = "rgb_array",
     ):
-        asked = SimpleNamespace(**{name: value for name, value in locals().items() if name != "self"})
+        asked = SimpleNamespace(**locals())
         with _as_value_error():
             check_door(asked)
             check_choice(asked, "kind", (*KINDS, "random"))
@@ -140,8 +126,8 @@ class DoorEnv(gym.Env):
         self.start_variation = start_variation
         self.command_limit = command_limit
         self.hold_seconds = hold_seconds
-        self.observation_size = int(observation_size)
-        self.render_size = int(render_size)
+        self.observation_size = observation_size
+        self.render_size = render_size
         self.render_mode = render_mode
         self.joint_names = (*self.arm.joints, "gripper")
 
@@ -150,16 +136,13 @@ class DoorEnv(gym.Env):
         self.latch = Latch(self.model, self.data)
         self.kinematics = InverseKinematics(self.model, self.arm.joints)
         joints = [self.model.joint(name) for name in self.arm.joints]
+        drives = [self.model.actuator(name) for name in self.joint_names]
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
         self._fingers = [int(self.model.joint(name).qposadr[0]) for name in ("finger_left", "finger_right")]
-        self._actuators = np.array([self.model.actuator(name).id for name in self.joint_names])
+        self._actuators = np.array([drive.id for drive in drives])
         # Seconds by which a position servo trails a moving target: damping over stiffness.
-        self._servo_lag = (
-            -self.model.actuator_biasprm[self._actuators, 2] / self.model.actuator_gainprm[self._actuators, 0]
-        )
-        self._servo_lag[-1] = 0.0
-        self._low = np.array([*(joint.range[0] for joint in joints), 0.0])
-        self._high = np.array([*(joint.range[1] for joint in joints), 1.0])
+        self._servo_lag = np.array([*(-drive.biasprm[2] / drive.gainprm[0] for drive in drives[:-1]), 0.0])
+        self._low, self._high = np.array([*(joint.range for joint in joints), (0.0, 1.0)]).T
         self._max_change = np.array([*self.arm.joint_speed, GRIPPER_SPEED]) * CONTROL_STEPS * self.model.opt.timestep
         self._doorway = int(self.model.body("doorway").id)
         self._doorway_home = self.model.body_pos[self._doorway].copy()
@@ -170,7 +153,7 @@ class DoorEnv(gym.Env):
         self._picture_poses: NDArray[np.float64] = np.empty(0)
 
         self.action_space = gym.spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32))
-        image = gym.spaces.Box(0, 255, (self.observation_size, self.observation_size, 3), np.uint8)
+        image = gym.spaces.Box(0, 255, (observation_size, observation_size, 3), np.uint8)
         # Joint limits are soft in MuJoCo: a measurement may lie a little beyond them.
         measured = gym.spaces.Box((self._low - 0.5).astype(np.float32), (self._high + 0.5).astype(np.float32))
         self.observation_space = gym.spaces.Dict({"pixels": gym.spaces.Dict({"front": image}), "agent_pos": measured})
@@ -178,20 +161,7 @@ class DoorEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Closes the door and puts the arm in front of it.
-
-        Args:
-            seed (`int`, *optional*):
-                Seed of all draws.
-            options (`dict`, *optional*):
-                May hold `kind` (`str`) and `door_offset` (`float`, at most 0.05 either way).
-
-        Returns:
-            `tuple[dict, dict]`: observation and info.
-
-        Raises:
-            ValueError: If an option is unknown or out of range.
-        """
+        """Closes the door and puts the arm in front of it; an unknown or bad option is a ValueError."""
         super().reset(seed=seed)
         options = dict(options or {})
         # Always the same draws in the same order, whatever is overridden: seeds stay comparable across kinds.
@@ -222,13 +192,6 @@ class DoorEnv(gym.Env):
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Moves towards a target for 0.1 s.
-
-        Args:
-            action (`NDArray[np.float32]`):
-                Joint targets in rad and gripper target in 0 to 1, shape `(len(joint_names),)`.
-
-        Returns:
-            `tuple`: observation, reward (1.0 while the door is open, else 0.0), terminated, truncated, info.
 
         Raises:
             ValueError: If the action has the wrong shape or is not finite.

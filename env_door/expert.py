@@ -13,29 +13,17 @@ from numpy.typing import NDArray
 
 from env_door.env import GRASP_ROTATION, DoorEnv
 from env_door.kinematics import rotation_about
-from env_door.latch import KINDS
+from env_door.latch import KINDS, OPENINGS
 from env_door.scene import GRIPPER_STROKE
 
-TWIST_ANGLE = 0.95
-"""Twist of the knob in rad; the latch lets go past 0.7."""
-
+TWIST_ANGLE = 0.95  # of the knob in rad
 GRASP_CLOSURE = 1.0 - (0.028 - 0.005) / GRIPPER_STROKE
 """Gripper target on the knob's 28 mm bar: 5 mm tighter gives full grip force, yet stays near what is measured."""
 
-STANDOFF = 0.08
-"""Distance in metres from the knob at which the approach ends and the straight advance begins."""
-
-HINGE_FROM_KNOB = np.array([0.086, 0.34, 0.0])
-"""From the knob to the hinge's axis, in metres."""
-
-OPEN_ANGLE = 0.52
-"""Turn of a hinged door in rad at the end of the opening motion."""
-
-OPEN_DISTANCE = 0.19
-"""Travel of a sliding door in metres at the end of the opening motion."""
-
-PROBE_DISTANCE = 0.03
-"""Travel of the tool in metres when a direction is only tried."""
+STANDOFF = 0.08  # distance in m from the knob at which the approach ends and the straight advance begins
+HINGE_FROM_KNOB = np.array([0.086, 0.34, 0.0])  # from the knob to the hinge's axis, in m
+OPEN_TRAVEL = {"hinge": 0.52, "slide": 0.19}  # of the door at the end of the opening motion, in rad or m
+PROBE_DISTANCE = 0.03  # travel of the tool in m when a direction is only tried
 
 TRY_AXES = {
     "push": np.array([1.0, 0.0, 0.0]),
@@ -63,12 +51,9 @@ class Waypoint:
 
     shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """Tool position relative to the closed door's knob in m, before any opening motion, shape `(3,)`."""
-    twist: float = 0.0
-    """Twist of the gripper about the knob's axis in rad."""
-    gripper: float = 0.0
-    """Gripper target, 0 open to 1 closed."""
-    travel: float = 0.0
-    """Opening motion along `direction`, in rad (push, pull) or m (slide)."""
+    twist: float = 0.0  # of the gripper about the knob's axis in rad
+    gripper: float = 0.0  # target, 0 open to 1 closed
+    travel: float = 0.0  # of the door its own way, in rad (push, pull) or m (slide)
     direction: str = "push"
 
     def towards(self, end: "Waypoint", fraction: float) -> "Waypoint":
@@ -85,21 +70,19 @@ class Waypoint:
         """Position `(3,)` and rotation matrix `(3, 3)` of the tool, given the position of the closed door's knob."""
         position = knob + self.shift
         rotation = rotation_about(np.array([1.0, 0.0, 0.0]), self.twist) @ GRASP_ROTATION
-        if self.direction == "slide":
-            return position + np.array([0.0, self.travel, 0.0]), rotation
-        turn = rotation_about(np.array([0.0, 0.0, 1.0]), self.travel if self.direction == "push" else -self.travel)
+        opening = OPENINGS[self.direction]
+        travel = opening.sign * self.travel
+        if opening.joint == "slide":
+            return position + np.array([0.0, travel, 0.0]), rotation
+        turn = rotation_about(np.array([0.0, 0.0, 1.0]), travel)
         hinge = knob + HINGE_FROM_KNOB
         return hinge + turn @ (position - hinge), turn @ rotation
 
 
 class DoorExpert:
-    """Opens the door, after trying wrong directions first where told to; knows the knob's place, but not the kind.
+    """Opens the door of an unwrapped environment; knows the knob's place, but not the kind.
 
-    Args:
-        env (`DoorEnv`):
-            The unwrapped environment.
-        directions (`Sequence[str]`, *optional*, defaults to `("push",)`):
-            Directions to try in order, each one of `KINDS`; the last one is carried through.
+    Tries the `directions` in order, each one of `KINDS`, and carries the last one through.
     """
 
     def __init__(self, env: DoorEnv, directions: Sequence[str] = ("push",)):
@@ -120,13 +103,13 @@ class DoorExpert:
         Raises:
             UnreachableError: If the arm cannot reach a pose of the plan.
         """
-        data, kinematics = self._env.data, self._env.kinematics
-        knob = data.site("knob").xpos.copy()
+        kinematics = self._env.kinematics
+        knob = self._env.data.site("knob").xpos.copy()
         joints = self._env.measured_joints()[:-1]
-        start = kinematics.forward(joints)[0] - knob
+        start = Waypoint(shift=kinematics.forward(joints)[0] - knob)
         self._plan = []
         self._step = 0
-        for phase, begin, end in self._stages(Waypoint(shift=start)):
+        for phase, begin, end in self._stages(start):
             low, high = PHASE_STEPS[phase.split("_")[0]]
             num_steps = int(rng.integers(low, high + 1))
             for step in range(1, num_steps + 1):
@@ -146,8 +129,7 @@ class DoorExpert:
 
     @property
     def phase(self) -> str:
-        """`str`: phase of the step that `act` returns next: approach, advance, grasp, twist, try_<direction>, return,
-        open, or hold once the plan is done."""
+        """What `act` does next: approach, advance, grasp, twist, try_<direction>, return, open; hold after the plan."""
         return self._plan[self._step][0] if self._step < len(self._plan) else "hold"
 
     def _stages(self, start: Waypoint) -> list[tuple[str, Waypoint, Waypoint]]:
@@ -164,10 +146,9 @@ class DoorExpert:
         for direction in self.directions[:-1]:
             tried = replace(twisted, shift=PROBE_DISTANCE * TRY_AXES[direction])
             stages += [(f"try_{direction}", twisted, tried), ("return", tried, twisted)]
-        last = self.directions[-1]
-        opened = replace(twisted, direction=last, travel=OPEN_DISTANCE if last == "slide" else OPEN_ANGLE)
-        stages.append(("open", replace(twisted, direction=last), opened))
-        return stages
+        shut = replace(twisted, direction=self.directions[-1])
+        opened = replace(shut, travel=OPEN_TRAVEL[OPENINGS[shut.direction].joint])
+        return [*stages, ("open", shut, opened)]
 
 
 def ease(fraction: float, ramp: float = 0.25) -> float:

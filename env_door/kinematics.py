@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import mujoco
 
-POSITION_TOLERANCE = 1e-5
-ROTATION_TOLERANCE = 1e-4
+POSITION_TOLERANCE = 1e-5  # m
+ROTATION_TOLERANCE = 1e-4  # rad
+DAMPING = 0.01  # per squared error; keeps steps small near singular poses
 MIN_DAMPING = 1e-8
+MAX_STEP = 0.3  # rad
 
 
 class UnreachableError(ValueError):
@@ -28,22 +30,13 @@ class UnreachableError(ValueError):
 
 
 class InverseKinematics:
-    """Solver for one arm; keeps its own `MjData`, so the simulation is never disturbed.
+    """Solver for the arm whose joints are named; keeps its own `MjData`, so the simulation is never disturbed.
 
-    Args:
-        model (`mujoco.MjModel`):
-            The scene.
-        joints (`tuple[str, ...]`):
-            Names of the arm's joints.
-        damping (`float`, *optional*, defaults to `0.01`):
-            Damping per squared error; keeps steps small near singular poses.
-        max_iterations (`int`, *optional*, defaults to `200`):
-            Iterations after which a pose counts as unreachable.
+    Joint angles are in rad, shape `(num_joints,)`; poses of the tool are a position in m `(3,)` and a rotation matrix
+    `(3, 3)` in the world frame. A pose that is not found after `max_iterations` counts as unreachable.
     """
 
-    def __init__(
-        self, model: "mujoco.MjModel", joints: tuple[str, ...], damping: float = 0.01, max_iterations: int = 200
-    ):
+    def __init__(self, model: "mujoco.MjModel", joints: tuple[str, ...], max_iterations: int = 200):
         import mujoco
 
         self._mujoco = mujoco
@@ -51,53 +44,28 @@ class InverseKinematics:
         self._data = mujoco.MjData(model)
         self._qpos = np.array([model.joint(name).qposadr[0] for name in joints])
         self._dofs = np.array([model.joint(name).dofadr[0] for name in joints])
-        self._ranges = np.array([model.joint(name).range for name in joints])
+        self._low, self._high = np.array([model.joint(name).range for name in joints]).T
         self._site = int(model.site("tool").id)
-        self._damping = damping
         self._max_iterations = max_iterations
 
     def forward(self, joints: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pose of the tool at some joint angles.
-
-        Args:
-            joints (`NDArray[np.float64]`):
-                Joint angles in rad, shape `(num_joints,)`.
-
-        Returns:
-            `tuple[NDArray, NDArray]`: position in m `(3,)` and rotation matrix `(3, 3)` in the world frame.
-        """
+        """Pose of the tool at some joint angles."""
         self._data.qpos[self._qpos] = joints
         self._mujoco.mj_kinematics(self._model, self._data)
         return self._data.site_xpos[self._site].copy(), self._data.site_xmat[self._site].reshape(3, 3).copy()
 
     def jacobian(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Velocity (m/s) and angular velocity (rad/s) of the tool, in the world frame, for each joint's speed.
-
-        Args:
-            joints (`NDArray[np.float64]`):
-                Joint angles in rad, shape `(num_joints,)`.
-
-        Returns:
-            `NDArray[np.float64]`: the Jacobian, shape `(6, num_joints)`.
-        """
+        """Velocity (m/s) and angular velocity (rad/s) of the tool for each joint's speed, `(6, num_joints)`."""
         self.forward(joints)
-        return self._jacobian_here()
+        jacobian = np.zeros((6, self._model.nv))
+        self._mujoco.mj_comPos(self._model, self._data)
+        self._mujoco.mj_jacSite(self._model, self._data, jacobian[:3], jacobian[3:], self._site)
+        return jacobian[:, self._dofs]
 
     def solve(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], start: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Joint angles that bring the tool to a pose.
-
-        Args:
-            position (`NDArray[np.float64]`):
-                Wanted tool position in m, shape `(3,)`, world frame.
-            rotation (`NDArray[np.float64]`):
-                Wanted tool rotation matrix, shape `(3, 3)`.
-            start (`NDArray[np.float64]`):
-                Joint angles in rad from which to search; the solution stays on their branch.
-
-        Returns:
-            `NDArray[np.float64]`: joint angles in rad, within the joint limits.
+        """Joint angles within their limits that bring the tool to a pose, on the branch of those to `start` from.
 
         Raises:
             UnreachableError: If no solution is found.
@@ -109,21 +77,15 @@ class InverseKinematics:
             position_error, rotation_error = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
             if position_error < POSITION_TOLERANCE and rotation_error < ROTATION_TOLERANCE:
                 return joints
-            jacobian = self._jacobian_here()
-            damping = self._damping * (error @ error) + MIN_DAMPING
+            jacobian = self.jacobian(joints)
+            damping = DAMPING * (error @ error) + MIN_DAMPING
             step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), error)
-            joints = np.clip(joints + np.clip(step, -0.3, 0.3), self._ranges[:, 0], self._ranges[:, 1])
+            joints = np.clip(joints + np.clip(step, -MAX_STEP, MAX_STEP), self._low, self._high)
         raise UnreachableError(
             f"the tool cannot reach position {np.round(position, 3).tolist()} m with the wanted orientation: after "
             f"{self._max_iterations} iterations it is {position_error * 1000:.1f} mm and {rotation_error:.3f} rad off; "
             "move the target closer to the middle of the workspace, or start from another pose"
         )
-
-    def _jacobian_here(self) -> NDArray[np.float64]:
-        jacobian = np.zeros((6, self._model.nv))
-        self._mujoco.mj_comPos(self._model, self._data)
-        self._mujoco.mj_jacSite(self._model, self._data, jacobian[:3], jacobian[3:], self._site)
-        return jacobian[:, self._dofs]
 
 
 def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

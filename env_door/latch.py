@@ -14,24 +14,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from draccus.utils import ParsingError
 
 if TYPE_CHECKING:
     import mujoco
 
-KINDS = ("push", "pull", "slide")
-"""Kinds of door, which are also the directions in which a robot can try to open one."""
-
-UNLATCH_ANGLE = 0.7
-"""Twist of the knob in rad beyond which the latch lets go."""
-
+UNLATCH_ANGLE = 0.7  # twist of the knob in rad beyond which the latch lets go
 LOAD_STEPS = 100
 """Physics steps (of 2 ms) for which a load must last: a robot that trembles tries nothing, one that pushes does."""
-
-
-def check_kinds(kinds: Sequence[str], option: str) -> None:
-    """Raises ValueError unless the names are those of kinds of door, each once; `option` is what the user set."""
-    if not kinds or sorted(kinds) != sorted(set(kinds) & set(KINDS)):
-        raise ValueError(f"{option} must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
 
 
 @dataclass(frozen=True)
@@ -40,14 +30,10 @@ class Opening:
 
     joint: str
     sign: int
-    break_load: float
-    """Load that frees it, in N m (hinge) or N (slide)."""
-    threshold: float
-    """Travel that counts as open."""
-    limit: float
-    """Travel at which the door meets its stop."""
-    still_speed: float
-    """Speed below which the door counts as nearly still."""
+    break_load: float  # that frees it, in N m (hinge) or N (slide)
+    threshold: float  # travel that counts as open
+    limit: float  # travel at which the door meets its stop
+    still_speed: float  # below which the door counts as nearly still
 
 
 OPENINGS = {
@@ -55,6 +41,15 @@ OPENINGS = {
     "pull": Opening("hinge", -1, break_load=10.0, threshold=0.40, limit=0.8, still_speed=0.15),
     "slide": Opening("slide", +1, break_load=12.0, threshold=0.14, limit=0.24, still_speed=0.05),
 }
+
+KINDS = tuple(OPENINGS)
+"""Kinds of door, which are also the directions in which a robot can try to open one."""
+
+
+def check_kinds(kinds: Sequence[str], option: str) -> None:
+    """Raises ParsingError unless the names are those of kinds of door, each once; `option` is what the user set."""
+    if not kinds or sorted(kinds) != sorted(set(kinds) & set(KINDS)):
+        raise ParsingError(f"{option} must be one or more of {list(KINDS)}, each once, got {list(kinds)}.")
 
 
 class Latch:
@@ -66,7 +61,7 @@ class Latch:
     def __init__(self, model: "mujoco.MjModel", data: "mujoco.MjData"):
         self._model = model
         self._data = data
-        joints = ("slide", "hinge")
+        joints = {opening.joint for opening in OPENINGS.values()}
         self._lock = {joint: int(model.equality(f"lock_{joint}").id) for joint in joints}
         self._joint = {joint: int(model.joint(joint).id) for joint in joints}
         self._qpos = {joint: int(model.joint(joint).qposadr[0]) for joint in joints}
@@ -77,8 +72,6 @@ class Latch:
 
     def reset(self, kind: str) -> None:
         """Closes and locks the door, and makes it one of the given kind. Call after `mujoco.mj_resetData`."""
-        if kind not in KINDS:
-            raise ValueError(f"kind={kind!r} is unknown; choose one of {KINDS}")
         self.kind = kind
         self.freed = False
         self.attempts: tuple[str, ...] = ()
@@ -135,21 +128,18 @@ class Latch:
         door is loaded meanwhile, as strongly and as long as a try, go to `tried_while_held`. `num_steps` physics steps
         replace a hold that still lasts; 0 ends it.
         """
-        if num_steps < 0:
-            raise ValueError(f"num_steps={num_steps} must not be negative")
         self._held_steps = num_steps
         if self.freed:
             joint = OPENINGS[self.kind].joint
             if num_steps > 0:
                 self._lock_at(joint, float(self._data.qpos[self._qpos[joint]]))
             else:
-                self._unlock(joint)
+                self._unlock()
 
     def update(self) -> None:
         """Looks at the loads after one physics step; frees the door when it is loaded its own way."""
         held = self.held
-        if held:
-            self._held_steps -= 1
+        self._held_steps = max(0, self._held_steps - 1)
         # Only a shut or held panel resists in every direction; while the latch is in, loads are no tries.
         if not (held if self.freed else self.unlatched):
             self._loaded_steps = dict.fromkeys(KINDS, 0)
@@ -159,7 +149,7 @@ class Latch:
             if tried is not None and tried != self.kind:
                 self.tried_while_held = _with(self.tried_while_held, tried)
             if not self.held:
-                self._unlock(OPENINGS[self.kind].joint)
+                self._unlock()
         elif tried is not None:
             self.attempts = _with(self.attempts, tried)
             if tried == self.kind and not held:
@@ -178,17 +168,16 @@ class Latch:
     def _free(self) -> None:
         opening = OPENINGS[self.kind]
         self.freed = True
-        self._unlock(opening.joint)
+        self._unlock()
         limits = (0.0, opening.limit) if opening.sign > 0 else (-opening.limit, 0.0)
         self._model.jnt_range[self._joint[opening.joint]] = limits
 
     def _lock_at(self, joint: str, position: float) -> None:
-        equality = self._lock[joint]
-        self._model.eq_data[equality, 0] = position
-        self._data.eq_active[equality] = 1
+        self._model.eq_data[self._lock[joint], 0] = position
+        self._data.eq_active[self._lock[joint]] = 1
 
-    def _unlock(self, joint: str) -> None:
-        self._data.eq_active[self._lock[joint]] = 0
+    def _unlock(self) -> None:
+        self._data.eq_active[self._lock[OPENINGS[self.kind].joint]] = 0
 
 
 def _with(directions: tuple[str, ...], direction: str) -> tuple[str, ...]:

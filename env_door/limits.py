@@ -3,20 +3,11 @@
 from env_door.checks import check_choice, check_range
 from env_door.scene import ARMS
 
-FPS = 10
-"""Control steps a second."""
-
-EPISODE_STEPS = 300
-"""Control steps after which a trial is cut."""
-
-IMAGE_SIZE = 128
-"""Height and width in pixels of the images that a policy sees."""
-
-MAX_OFFSET = 0.05
-"""Largest sideways shift of the door in metres."""
-
-MAX_HOLD = 60.0
-"""Longest time in seconds for which somebody holds the door."""
+FPS = 10  # control steps a second
+EPISODE_STEPS = 300  # control steps after which a trial is cut
+IMAGE_SIZE = 128  # height and width in pixels of the images that a policy sees
+MAX_OFFSET = 0.05  # largest sideways shift of the door in m
+MAX_HOLD = 60.0  # longest time in s for which somebody holds the door
 
 
 def check_door(config: object) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from env_door.recording_config import RecordConfig
+from env_door.staging import is_empty
 
 PROVENANCE_PATH = Path("meta/door_recording.json")
 
@@ -14,12 +15,9 @@ PROVENANCE_PATH = Path("meta/door_recording.json")
 class Provenance:
     """Settings and seeds of a dataset."""
 
-    settings: dict[str, Any]
-    """Options that all episodes share."""
-    episodes: list[dict[str, Any]] = field(default_factory=list)
-    """`kind` and `seed` of each episode."""
-    dropped_seeds: list[int] = field(default_factory=list)
-    """Seeds that were tried and not used."""
+    settings: dict[str, Any]  # options that all episodes share
+    episodes: list[dict[str, Any]] = field(default_factory=list)  # `kind` and `seed` of each
+    dropped_seeds: list[int] = field(default_factory=list)  # tried and not used: the expert failed at one kind
 
     @property
     def next_seed(self) -> int:
@@ -29,26 +27,20 @@ class Provenance:
 
     @classmethod
     def open(cls, config: RecordConfig) -> "Provenance":
-        """Read the provenance of the dataset to go on with, or start one.
-
-        Raises:
-            FileExistsError: If the folder holds something and `resume` is off.
-            ValueError: If the folder holds something else, or episodes recorded with other settings.
-        """
+        """Read the provenance of the dataset to go on with, or start one."""
         root = config.path
         settings = json.loads(json.dumps(config.settings))
-        if not root.exists() or not any(root.iterdir()):
+        if is_empty(root):
             return cls(settings)
         if not config.resume:
             raise FileExistsError(
                 f"{root} is not empty. Use --resume=true to go on with the recording in it, or choose another root."
             )
-        try:
-            provenance = cls(**json.loads((root / PROVENANCE_PATH).read_text()))
-        except FileNotFoundError as error:
+        if not (root / PROVENANCE_PATH).exists():
             raise ValueError(
                 f"{root} holds no recording of the door: {PROVENANCE_PATH} is missing. Choose another root."
-            ) from error
+            )
+        provenance = cls(**json.loads((root / PROVENANCE_PATH).read_text()))
         for name, value in settings.items():
             if provenance.settings.get(name) != value:
                 raise ValueError(

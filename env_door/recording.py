@@ -11,7 +11,6 @@ recording, the dataset on disk is readable and holds whole, matched episodes.
 import contextlib
 import logging
 import shutil
-import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from tqdm import tqdm
 
 from env_door.demonstration import Demonstration, demonstrate, spread
 from env_door.env import DoorEnv
-from env_door.limits import FPS
+from env_door.limits import FPS, IMAGE_SIZE
 from env_door.provenance import Provenance
 from env_door.recording_config import ROBOT_TYPES, RecordConfig
 from env_door.staging import StagedDirectory
@@ -39,73 +38,49 @@ MAX_DROPS_IN_A_ROW = 20
 class RecordReport:
     """What a recording did."""
 
-    root: Path
+    provenance: Provenance  # of the whole dataset, with the episodes of earlier runs
     episodes: list[dict[str, Any]] = field(default_factory=list)
     """`episode_index`, `kind`, `seed`, `branch_step` and `success_step` of each episode that this run saved."""
-    total_episodes: int = 0
-    """Episodes in the dataset, with those of earlier runs."""
-    dropped_seeds: list[int] = field(default_factory=list)
-    """Seeds at which the expert failed at one kind, with those of earlier runs."""
-    seconds: float = 0.0
-    """Duration of this run."""
 
 
 def record(config: RecordConfig) -> RecordReport:
     """Record demonstrations of the scripted expert, push the dataset to the Hub if asked, and report.
-
-    Args:
-        config (`RecordConfig`):
-            What to record, and where to.
-
-    Returns:
-        `RecordReport`: What was saved and what was dropped.
 
     Raises:
         FileExistsError: If the folder holds something and `resume` is off.
         ValueError: If an option does not fit the dataset to go on with.
         RuntimeError: If the expert keeps failing, or the upload fails; the dataset on disk stays whole.
     """
-    start = time.perf_counter()
-    env = DoorEnv(kind=config.kinds[0], arm=config.arm, door_offset=config.door_offset)
-    try:
-        with StagedDirectory(config.path) as directory:
-            provenance = Provenance.open(config)
-            report = RecordReport(config.path, dropped_seeds=provenance.dropped_seeds)
-            try:
-                _record_missing(config, env, directory, provenance, report)
-            except (Exception, KeyboardInterrupt):
-                if provenance.episodes:
-                    logger.warning(
-                        f"Recording stopped: {len(provenance.episodes)} of {config.total_episodes} episodes are safe "
-                        f"in {config.path}. Go on with the same command and --resume=true."
-                    )
-                raise
-    finally:
-        env.close()
-    report.total_episodes = len(provenance.episodes)
-    report.seconds = time.perf_counter() - start
-    logger.info(
-        f"{len(report.episodes)} episodes saved to {config.path} in {report.seconds:.0f} s "
-        f"({report.total_episodes} in all, {len(report.dropped_seeds)} seeds dropped)."
-    )
+    with (
+        contextlib.closing(DoorEnv(config.kinds[0], config.arm, config.door_offset)) as env,
+        StagedDirectory(config.path) as directory,
+    ):
+        report = RecordReport(Provenance.open(config))
+        try:
+            _record_missing(config, env, directory, report)
+        except (Exception, KeyboardInterrupt):
+            if safe := len(report.provenance.episodes):
+                logger.warning(
+                    f"Recording stopped: {safe} of {config.total_episodes} episodes are safe in {config.path}. "
+                    "Go on with the same command and --resume=true."
+                )
+            raise
     if config.push_to_hub:
         _push(config)
     return report
 
 
-def _record_missing(
-    config: RecordConfig, env: DoorEnv, directory: StagedDirectory, provenance: Provenance, report: RecordReport
-) -> None:
-    done = len(provenance.episodes)
-    with tqdm(total=config.total_episodes, initial=done, desc="Recording", unit="episode") as progress:
-        while len(provenance.episodes) < config.total_episodes:
+def _record_missing(config: RecordConfig, env: DoorEnv, directory: StagedDirectory, report: RecordReport) -> None:
+    provenance, total = report.provenance, config.total_episodes
+    with tqdm(total=total, initial=len(provenance.episodes), desc="Recording", unit="episode") as progress:
+        while len(provenance.episodes) < total:
             group = _demonstrate_group(config, env, provenance, progress)
-            sources = [{"kind": demonstration.kind, "seed": demonstration.seed} for demonstration in group]
+            sources = [{"kind": run.kind, "seed": run.seed} for run in group]
             with directory.change() as staged:
                 _write_episodes(config, env, staged, group)
                 replace(provenance, episodes=provenance.episodes + sources).write(staged)
-            for demonstration, source in zip(group, sources, strict=True):
-                steps = {"branch_step": demonstration.branch_step, "success_step": demonstration.success_step}
+            for run, source in zip(group, sources, strict=True):
+                steps = {"branch_step": run.branch_step, "success_step": run.success_step}
                 report.episodes.append({"episode_index": len(provenance.episodes)} | source | steps)
                 provenance.episodes.append(source)
             progress.update(len(group))
@@ -120,14 +95,14 @@ def _demonstrate_group(
         kinds = [kinds[len(provenance.episodes) % len(kinds)]]
     for _ in range(MAX_DROPS_IN_A_ROW):
         seed = provenance.next_seed
+        # Where each kind has seeds of its own, positions that follow from the seed could tell the kind.
+        door_offset = spread(seed) * config.door_offset if config.matched else None
         group = []
         for kind in kinds:
-            # Where each kind has seeds of its own, positions that follow from the seed could tell the kind.
-            door_offset = spread(seed) * config.door_offset if config.matched else None
-            demonstration = demonstrate(env, kind, seed, config.num_steps, door_offset)
-            if demonstration is None:
+            run = demonstrate(env, kind, seed, config.num_steps, door_offset)
+            if run is None:
                 break
-            group.append(demonstration)
+            group.append(run)
         else:
             return group
         provenance.dropped_seeds.append(seed)
@@ -155,17 +130,11 @@ def _write_episodes(config: RecordConfig, env: DoorEnv, staged: Path, group: lis
     if staged.exists():
         dataset = LeRobotDataset.resume(config.repo_id, **options)
     else:
-        dataset = LeRobotDataset.create(
-            config.repo_id,
-            fps=FPS,
-            features=_features(config, env),
-            robot_type=ROBOT_TYPES[config.arm],
-            **options,
-        )
+        robot = ROBOT_TYPES[config.arm]
+        dataset = LeRobotDataset.create(config.repo_id, FPS, _features(env), robot_type=robot, **options)
     try:
-        for demonstration in group:
-            frames = zip(demonstration.images, demonstration.states, demonstration.actions, strict=True)
-            for image, state, action in frames:
+        for run in group:
+            for image, state, action in zip(run.images, run.states, run.actions, strict=True):
                 dataset.add_frame({CAMERA: image, OBS_STATE: state, ACTION: action, "task": env.task_description})
             with SuppressProgressBars():
                 dataset.save_episode()
@@ -177,22 +146,17 @@ def _write_episodes(config: RecordConfig, env: DoorEnv, staged: Path, group: lis
         with contextlib.suppress(Exception):
             dataset.finalize()
         raise
-    _check_video(staged, num_frames=len(group) * config.num_steps)
+    wanted = len(group) * config.num_steps
+    with av.open(str(max((staged / "videos" / CAMERA).rglob("*.mp4")))) as newest:
+        found = newest.streams.video[0].frames
+    if found != wanted:
+        raise RuntimeError(f"The encoder wrote {found} of {wanted} frames; the episodes were thrown away.")
 
 
-def _check_video(root: Path, num_frames: int) -> None:
-    newest = max((root / "videos" / CAMERA).rglob("*.mp4"))
-    with av.open(str(newest)) as video:
-        found = video.streams.video[0].frames
-    if found != num_frames:
-        raise RuntimeError(f"The encoder wrote {found} of {num_frames} frames; the episodes were thrown away.")
-
-
-def _features(config: RecordConfig, env: DoorEnv) -> dict[str, dict[str, Any]]:
+def _features(env: DoorEnv) -> dict[str, dict[str, Any]]:
     joints = [f"{name}.pos" for name in env.joint_names]
     vector = {"dtype": "float32", "shape": (len(joints),), "names": joints}
-    size = env.observation_size
-    image = {"dtype": "video", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
+    image = {"dtype": "video", "shape": (IMAGE_SIZE, IMAGE_SIZE, 3), "names": ["height", "width", "channels"]}
     return {OBS_STATE: vector, ACTION: dict(vector), CAMERA: image}
 
 

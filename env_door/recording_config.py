@@ -1,6 +1,5 @@
 """What to record: the options of the recorder."""
 
-import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,11 +37,7 @@ class FrameEncoderConfig(RGBEncoderConfig):
 
 @dataclass
 class RecordConfig:
-    """What to record, and where to.
-
-    Raises:
-        ParsingError: If a field is out of its range.
-    """
+    """What to record, and where to."""
 
     repo_id: str
     """Name of the dataset, {hf_username}/{dataset_name}."""
@@ -74,15 +69,20 @@ class RecordConfig:
     """Go on with an interrupted recording, or extend a finished one."""
 
     def __post_init__(self) -> None:
-        _check_repo_id(self.repo_id)
+        wanted = "repo_id must read {hf_username}/{dataset_name}, for example my-name/door"
+        try:
+            validate_repo_id(self.repo_id)
+        except HFValidationError as error:
+            raise ParsingError(f"{wanted}: {error}") from error
+        if "/" not in self.repo_id:
+            raise ParsingError(f"{wanted}; got {self.repo_id!r}.")
+        if "/eval_" in self.repo_id:
+            raise ParsingError(f"Dataset names starting with 'eval_' are reserved for evaluations, got {self.repo_id}.")
         check_range(self, "episodes_per_kind", "num_steps", low=1)
         check_range(self, "seed", low=0)
         check_choice(self, "arm", ROBOT_TYPES)
         check_range(self, "door_offset", low=0.0, high=MAX_OFFSET, unit="m")
-        try:
-            check_kinds(self.kinds, "kinds")
-        except ValueError as error:
-            raise ParsingError(str(error)) from None
+        check_kinds(self.kinds, "kinds")
 
     @property
     def path(self) -> Path:
@@ -98,15 +98,3 @@ class RecordConfig:
     def settings(self) -> dict[str, Any]:
         """The options that every episode of a dataset must share."""
         return {name: value for name, value in asdict(self).items() if name not in FREE_OPTIONS}
-
-
-def _check_repo_id(repo_id: str) -> None:
-    wanted = "repo_id must read {hf_username}/{dataset_name}, for example my-name/door"
-    try:
-        validate_repo_id(repo_id)
-    except HFValidationError as error:
-        raise ParsingError(f"{wanted}: {error}") from error
-    if "/" not in repo_id:
-        raise ParsingError(f"{wanted}; got {repo_id!r}.")
-    if re.search("/eval_", repo_id):
-        raise ParsingError(f"Dataset names starting with 'eval_' are reserved for evaluations, got {repo_id!r}.")

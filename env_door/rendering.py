@@ -13,7 +13,7 @@ import importlib
 import os
 import sys
 import warnings
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from env_door.ray_casting import RayCastRenderer
 from env_door.simulator import mujoco
 
-_EGL_PLATFORM_DEVICE = 0x313F
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # the first that is installed draws
 _MAX_GEOMS = 1000  # MuJoCo's default of 10000 makes a scene slower to create; this one has some 50
 _SMOOTHING = 1.5  # a smooth picture is drawn this much larger
 _OFF = ("disable", "disabled", "off", "false", "0")
@@ -33,78 +33,39 @@ _RAY_NOTICE = (
 
 
 def choose_backend() -> str:
-    """How to draw here, found out without risk to the process.
-
-    Returns:
-        `str`: `egl`, `osmesa`, `glfw`, `mujoco` (its own choice, safe on macOS and Windows), or `disable`: ray-casting.
-
-    Raises:
-        RuntimeError: If the user's own choice is EGL or OSMesa and that library does not work here.
-    """
-    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    """`egl`, `osmesa`, `glfw`, `mujoco` (its own choice, safe on macOS and Windows), or `disable`: ray-casting."""
+    chosen = _user_choice()
     if chosen in _OFF:
         return "disable"
     if not sys.platform.startswith("linux"):
         return "mujoco"
-    works = {"egl": _egl_works, "osmesa": _osmesa_works}
-    if chosen in works and not works[chosen]():
-        raise RuntimeError(
-            f"MUJOCO_GL={chosen} is set, but that library does not work on this machine; unset MUJOCO_GL to let "
-            "env_door choose, or set MUJOCO_GL=disable for pictures without OpenGL"
-        )
-    if chosen in works:
+    if chosen in _LIBRARIES:
         return chosen
     if chosen in ("glfw", "glx"):
         # Even trying GLFW without a display would end the process.
         return "glfw" if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") else "disable"
     # PyOpenGL serves one of them in a process: whoever was here before may have settled which.
     settled = os.environ.get("PYOPENGL_PLATFORM", "").strip().lower()
-    return next((name for name in works if settled in ("", name) and works[name]()), "disable")
+    return next((name for name in _LIBRARIES if settled in ("", name) and _is_installed(name)), "disable")
 
 
-def _osmesa_works() -> bool:
-    return ctypes.util.find_library("OSMesa") is not None
+def _user_choice() -> str:
+    return os.environ.get("MUJOCO_GL", "").strip().lower()
 
 
-def _egl_works() -> bool:
-    """Whether some EGL device initialises: asked of libEGL itself, as MuJoCo will do later."""
+def _is_installed(backend: str) -> bool:
+    library = _LIBRARIES[backend]
     try:
-        egl = ctypes.CDLL(ctypes.util.find_library("EGL") or "libEGL.so.1")
-        egl.eglGetProcAddress.restype = ctypes.c_void_p
-        query = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
-        display = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
-        if not query or not display:
-            return False
-        count = ctypes.c_int(0)
-        devices = (ctypes.c_void_p * 16)()
-        query_devices = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(query)
-        if not query_devices(16, ctypes.byref(devices), ctypes.byref(count)):
-            return False
-        get_display = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p)(display)
-        egl.eglInitialize.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
-        for device in devices[: count.value]:
-            handle = get_display(_EGL_PLATFORM_DEVICE, device, None)
-            if handle and egl.eglInitialize(handle, None, None):
-                return True
-    except (OSError, AttributeError):
+        ctypes.CDLL(ctypes.util.find_library(library) or f"lib{library}.so.1")
+    except OSError:
         return False
-    return False
-
-
-class Renderer(Protocol):
-    """Draws the scene from one of its cameras."""
-
-    def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Picture of the current state, shape `(size, size, 3)`."""
-
-    def close(self) -> None:
-        """Frees what the renderer holds."""
+    return True
 
 
 class OpenGLRenderer:
-    """Draws with OpenGL; takes what `make_renderer` takes, and what `choose_backend` returns."""
+    """Draws with OpenGL; takes what `make_renderer` takes, and what `choose_backend` returned."""
 
-    def __init__(self, model: mujoco.MjModel, camera: str, size: int, smooth: bool = False, backend: str | None = None):
+    def __init__(self, model: mujoco.MjModel, camera: str, size: int, smooth: bool, backend: str):
         self._context: Any = None
         self._drawing: mujoco.MjrContext | None = None
         self._model = model
@@ -120,7 +81,6 @@ class OpenGLRenderer:
         # Shadows alone would multiply the cost of a picture by four on a CPU.
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = 0
-        backend = backend or choose_backend()
         package = mujoco if backend == "mujoco" else importlib.import_module(f"mujoco.{backend}")
         self._context = package.GLContext(drawn, drawn)
         self._context.make_current()
@@ -162,21 +122,13 @@ class OpenGLRenderer:
             self.close()
 
 
+Renderer = OpenGLRenderer | RayCastRenderer
+
+
 def make_renderer(model: mujoco.MjModel, camera: str, size: int, smooth: bool = False) -> Renderer:
-    """The best renderer that works here.
+    """The best renderer that works here, for square pictures; ray-casting comes with a warning.
 
-    Args:
-        model (`mujoco.MjModel`):
-            The scene.
-        camera (`str`):
-            Name of the camera.
-        size (`int`):
-            Height and width of the picture in pixels.
-        smooth (`bool`, *optional*, defaults to `False`):
-            Whether to smooth edges where OpenGL draws.
-
-    Returns:
-        `Renderer`: an `OpenGLRenderer`, or a `RayCastRenderer` and a warning where OpenGL does not work.
+    `smooth` smooths edges where OpenGL draws.
 
     Raises:
         RuntimeError: If the user set `MUJOCO_GL` to a library that does not work here.
@@ -189,6 +141,11 @@ def make_renderer(model: mujoco.MjModel, camera: str, size: int, smooth: bool = 
         return OpenGLRenderer(model, camera, size, smooth, backend)
     except Exception as error:
         # Drivers fail in many ways (ImportError, AttributeError, GLError, RuntimeError): all mean "no picture".
+        if backend in _LIBRARIES and _user_choice() == backend:
+            raise RuntimeError(
+                f"MUJOCO_GL={backend} is set, but that library does not work on this machine ({error}); unset "
+                "MUJOCO_GL to let env_door choose, or set MUJOCO_GL=disable for pictures without OpenGL"
+            ) from error
         _notice(f"OpenGL through {backend} failed ({error})")
         return RayCastRenderer(model, camera, size)
 

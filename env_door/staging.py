@@ -18,24 +18,17 @@ from filelock import FileLock, Timeout
 
 
 class StagedDirectory:
-    """A directory that is only ever changed as a whole.
+    """A directory that is only ever changed as a whole; it need not exist yet.
 
     While open, it keeps a hidden working folder beside the directory, `.<name>.staging`, which holds the copy and a
     lock against a second writer. The folder is removed on leaving; what a killed process left is cleared on entering.
-
-    Args:
-        root (`Path`):
-            The directory; it need not exist yet.
-
-    Raises:
-        OSError: On entering, if the place is not writable or another process is changing the directory.
+    Entering raises an OSError if the place is not writable or another process is changing the directory.
     """
 
     def __init__(self, root: Path):
         self.root = root
         self._work = root.parent / f".{root.name}.staging"
-        self._staged = self._work / "staged"
-        self._previous = self._work / "previous"
+        self._staged, self._previous, self._scratch = (self._work / name for name in ("staged", "previous", "scratch"))
         self._lock = FileLock(self._work / "lock")
 
     def __enter__(self) -> "StagedDirectory":
@@ -65,33 +58,33 @@ class StagedDirectory:
         """Give a copy of the directory to change, and put it in the directory's place when the block succeeds.
 
         Files under `meta/` are copied; all others are hard-linked and must not be changed in place, only added to
-        or replaced. Temporary files made inside the block (by `tempfile`) go to the working folder too.
-
-        Yields:
-            `Path`: The copy; it does not exist when the directory does not exist yet.
+        or replaced. Temporary files made inside the block (by `tempfile`) go to the working folder too. The copy does
+        not exist when the directory does not exist yet or is empty.
         """
-        outside, scratch = tempfile.tempdir, self._work / "scratch"
-        scratch.mkdir()
+        outside = tempfile.tempdir
+        self._scratch.mkdir()
         try:
-            tempfile.tempdir = str(scratch)
-            if self.root.exists() and any(self.root.iterdir()):
+            tempfile.tempdir = str(self._scratch)
+            if not is_empty(self.root):
                 shutil.copytree(self.root, self._staged, copy_function=_link_or_copy)
             yield self._staged
-            self._publish()
+            if is_empty(self.root):
+                os.replace(self._staged, self.root)
+            elif not exchange(self._staged, self.root):
+                os.rename(self.root, self._previous)
+                os.rename(self._staged, self.root)
         finally:
             tempfile.tempdir = outside
             self._clear()
 
-    def _publish(self) -> None:
-        if not self.root.exists() or not any(self.root.iterdir()):
-            os.replace(self._staged, self.root)
-        elif not exchange(self._staged, self.root):
-            os.rename(self.root, self._previous)
-            os.rename(self._staged, self.root)
-
     def _clear(self) -> None:
-        for leftover in (self._staged, self._previous, self._work / "scratch"):
+        for leftover in (self._staged, self._previous, self._scratch):
             shutil.rmtree(leftover, ignore_errors=True)
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether there is nothing in a folder, or no folder."""
+    return not folder.exists() or not any(folder.iterdir())
 
 
 def exchange(first: Path, second: Path) -> bool:

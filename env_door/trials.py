@@ -5,7 +5,6 @@ the first try or after a wrong one, is in the environment's `info` and would be 
 """
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,24 +20,15 @@ from env_door.latch import KINDS
 class Trial:
     """What happened in one trial."""
 
-    seed: int | None
-    """Seed that the environment was reset with; `None` when it was reset without one."""
+    seed: int | None  # `None` when the environment was reset without one
     door_kind: str
-    """Kind of the door: `"push"`, `"pull"` or `"slide"`."""
     success: bool
-    """Whether the door was opened."""
-    steps: int
-    """Control steps taken, 10 a second."""
-    attempts: tuple[str, ...]
-    """Directions in which the unlatched door was tried, in order."""
-    opening: float
-    """How far the door stood open at the end, 0 closed, 1 the success threshold."""
-    door_offset: float
-    """Lateral shift of the door in metres."""
-    held_at: int | None = None
-    """First control step, counted from 0, during which somebody held the door; `None` if nobody did."""
-    tried_while_held: tuple[str, ...] = ()
-    """Directions other than the door's own in which the opened door was tried while it was held, in order."""
+    steps: int  # control steps taken
+    attempts: tuple[str, ...]  # directions in which the unlatched door was tried, in order
+    opening: float  # at the end: 0 closed, 1 the success threshold
+    door_offset: float  # sideways shift in m
+    held_at: int | None = None  # first control step, counted from 0, during which somebody held the door
+    tried_while_held: tuple[str, ...] = ()  # directions other than its own tried meanwhile, in order
 
     @property
     def first_try_wrong(self) -> bool:
@@ -48,21 +38,12 @@ class Trial:
     @property
     def first_try(self) -> bool:
         """Whether the door was opened without a wrong attempt."""
-        return self.success and not self._tried_wrongly
-
-    @property
-    def recovered(self) -> bool:
-        """Whether the door was opened after at least one wrong attempt."""
-        return self.success and self._tried_wrongly
+        return self.success and set(self.attempts) <= {self.door_kind}
 
     @property
     def opened_after_hold(self) -> bool:
         """Whether the door was opened although it had been held."""
         return self.success and self.held_at is not None
-
-    @property
-    def _tried_wrongly(self) -> bool:
-        return any(attempt != self.door_kind for attempt in self.attempts)
 
 
 class TrialLog(gym.Wrapper):
@@ -70,12 +51,6 @@ class TrialLog(gym.Wrapper):
 
     A trial ends when the environment terminates or is truncated; one abandoned by an early reset leaves no line.
     Each line is a single write, so that parallel environments, also in other processes, may share the file.
-
-    Args:
-        env (`gym.Env`):
-            Door environment that ends its episodes (with a time limit inside).
-        path (`str | Path`):
-            File to append to; it and its folder are made when missing.
     """
 
     def __init__(self, env: gym.Env, path: str | Path):
@@ -100,50 +75,36 @@ class TrialLog(gym.Wrapper):
             self._held_at = self._steps
         if (terminated or truncated) and not self._finished:
             self._finished = True
-            self._append(info)
+            trial = Trial(
+                seed=self._seed,
+                door_kind=info["door_kind"],
+                success=bool(info["is_success"]),
+                steps=self._steps,
+                attempts=tuple(info["attempts"]),
+                opening=float(info["opening"]),
+                door_offset=float(self.get_wrapper_attr("current_offset")),
+                held_at=self._held_at,
+                tried_while_held=tuple(info["tried_while_held"]),
+            )
+            append_trial(self._path, trial)
         return observation, reward, terminated, truncated, info
-
-    def _append(self, info: dict[str, Any]) -> None:
-        trial = Trial(
-            seed=self._seed,
-            door_kind=info["door_kind"],
-            success=bool(info["is_success"]),
-            steps=self._steps,
-            attempts=tuple(info["attempts"]),
-            opening=float(info["opening"]),
-            door_offset=float(self.get_wrapper_attr("current_offset")),
-            held_at=self._held_at,
-            tried_while_held=tuple(info["tried_while_held"]),
-        )
-        append_trial(self._path, trial)
 
 
 def append_trial(path: str | Path, trial: Trial) -> None:
     """Add a trial to a log, in a single write."""
-    line = json.dumps(asdict(trial)) + "\n"
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        os.write(descriptor, line.encode())
-    finally:
-        os.close(descriptor)
+    with open(path, "ab", buffering=0) as log:
+        log.write(json.dumps(asdict(trial)).encode() + b"\n")
 
 
 def read_trials(path: str | Path) -> list[Trial]:
-    """Read a trial log.
-
-    Args:
-        path (`str | Path`):
-            File written by [`TrialLog`].
-
-    Returns:
-        `list[Trial]`: The trials in the order in which they ended.
+    """Read the trials of a log, in the order in which they ended.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If a line is not a trial, or a trial occurs twice; the message names the line.
     """
     trials: list[Trial] = []
-    seen: set[tuple[str, int]] = set()
+    seen: set[tuple[str, int | None]] = set()
     for number, line in enumerate(Path(path).read_text(errors="replace").splitlines(), start=1):
         if not line.strip():
             continue
@@ -154,13 +115,12 @@ def read_trials(path: str | Path) -> list[Trial]:
                 f"{path}, line {number} is not a trial ({error}): {line[:80]!r}. "
                 "Each line must be a JSON object as written by env_door.trials.TrialLog: remove or repair this one."
             ) from error
-        if trial.seed is not None:
-            if (trial.door_kind, trial.seed) in seen:
-                raise ValueError(
-                    f"{path}, line {number} repeats the trial {trial.door_kind}, seed {trial.seed}: the log holds more "
-                    "than one evaluation, perhaps one that was interrupted. Evaluate again into a new log."
-                )
-            seen.add((trial.door_kind, trial.seed))
+        if trial.seed is not None and (trial.door_kind, trial.seed) in seen:
+            raise ValueError(
+                f"{path}, line {number} repeats the trial {trial.door_kind}, seed {trial.seed}: the log holds more "
+                "than one evaluation, perhaps one that was interrupted. Evaluate again into a new log."
+            )
+        seen.add((trial.door_kind, trial.seed))
         trials.append(trial)
     return trials
 

@@ -15,12 +15,9 @@ GRIPPER_STROKE = 0.085
 class Arm:
     """What differs between the arms beyond their XML."""
 
-    name: str
-    """The value that `DoorEnv(arm=...)` takes; also the name of the XML file."""
-    joints: tuple[str, ...]
-    """Names of the arm's joints from base to wrist."""
-    joint_speed: tuple[float, ...]
-    """Largest joint speeds that the maker states, in rad/s."""
+    name: str  # also that of the XML file
+    joints: tuple[str, ...]  # from base to wrist
+    joint_speed: tuple[float, ...]  # largest that the maker states, in rad/s
     ready_pose: tuple[float, ...]
     """Joint angles in rad with the open gripper in front of the knob; inverse kinematics starts here, which keeps every
     plan on the same branch (elbow up)."""
@@ -42,13 +39,7 @@ ARMS = {arm.name: arm for arm in (UR5E, PANDA)}
 
 
 def load_model(arm: str) -> "mujoco.MjModel":
-    """Compiles the scene with one of the `ARMS`.
-
-    Raises:
-        ValueError: If there is no such arm.
-    """
+    """Compiles the scene with one of the `ARMS`."""
     from env_door.simulator import mujoco  # here, so that configurations can look up the arms without it
 
-    if arm not in ARMS:
-        raise ValueError(f"arm={arm!r} is unknown; choose one of {sorted(ARMS)}")
-    return mujoco.MjModel.from_xml_path(str(Path(__file__).parent / f"{arm}.xml"))
+    return mujoco.MjModel.from_xml_path(str(Path(__file__).with_name(f"{arm}.xml")))

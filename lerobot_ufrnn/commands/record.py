@@ -10,6 +10,6 @@ def run(config: RecordConfig) -> None:
     """Records, and says what was saved and what was dropped."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     report = record(config)
-    dropped = f", {len(report.dropped_seeds)} failed seed(s) dropped" if report.dropped_seeds else ""
-    new = f"{len(report.episodes)} new, {report.seconds:.0f} s"
-    print(f"{report.total_episodes} episodes in {report.root} ({new}{dropped})")
+    provenance = report.provenance
+    dropped = f", {len(provenance.dropped_seeds)} failed seed(s) dropped" if provenance.dropped_seeds else ""
+    print(f"{len(provenance.episodes)} episodes in {config.path} ({len(report.episodes)} new{dropped})")

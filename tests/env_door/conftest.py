@@ -1,6 +1,33 @@
+import os
+import subprocess
+import sys
+
 import pytest
 
 NUM_STEPS = 110
+UNSET = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")
+
+
+@pytest.fixture
+def run_fresh():
+    """Runs code in a new process without a display; returns its result."""
+
+    def run(code, **variables):
+        environment = {name: value for name, value in os.environ.items() if name not in UNSET} | variables
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def env():
+    # Here, so that tests that import nothing of the simulator can stand beside the others.
+    from env_door.env import DoorEnv
+
+    env = DoorEnv(door_offset=0.05)
+    yield env
+    env.close()
 
 
 @pytest.fixture(scope="session")

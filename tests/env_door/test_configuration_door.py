@@ -1,3 +1,5 @@
+import contextlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -18,43 +20,51 @@ class ExpertPolicy(torch.nn.Module):
 
     def __init__(self, envs, directions):
         super().__init__()
-        self.envs = envs
-        self.directions = directions
+        self.experts = [DoorExpert(env.unwrapped, tried) for env, tried in zip(envs, directions, strict=False)]
 
     def reset(self):
-        self.experts = None
+        self.is_planned = False
 
     def select_action(self, observation):
-        if self.experts is None:
-            self.experts = [
-                DoorExpert(env.unwrapped, directions)
-                for env, directions in zip(self.envs, self.directions, strict=False)
-            ]
-            for expert in self.experts:
-                expert.reset(np.random.default_rng(0))
         actions = observation["observation.state"].clone()
         for index, expert in enumerate(self.experts):
+            if not self.is_planned:
+                expert.reset(np.random.default_rng(0))
             actions[index] = torch.from_numpy(expert.act())
+        self.is_planned = True
         return actions
 
 
-def run(vector_env, directions, seeds):
-    def unchanged(batch):
-        return batch
+def unchanged(batch):
+    return batch
 
+
+def run(vector_env, directions, seeds):
     policy = ExpertPolicy(vector_env.envs, directions)
     return rollout(vector_env, policy, unchanged, unchanged, unchanged, unchanged, seeds=seeds)
 
 
-def test_type_is_registered():
-    config = make_env_config("door", task="pull", door_offset=0.03)
-    assert isinstance(config, DoorEnvConfig)
-    assert (config.type, config.task, config.door_offset, config.fps) == ("door", "pull", 0.03, 10)
+@pytest.fixture
+def make():
+    """Makes the vector environments of a configuration by suite, and closes them after the test."""
+    with contextlib.ExitStack() as made:
+
+        def make(n_envs=1, use_async_envs=False, **fields):
+            config = make_env_config("door", **fields)
+            suites = {name: tasks[0] for name, tasks in make_env(config, n_envs, use_async_envs).items()}
+            for env in suites.values():
+                made.callback(env.close)
+            return suites
+
+        yield make
 
 
 @pytest.mark.parametrize(("arm", "dimension"), [("ur5e", 7), ("panda", 8)])
-def test_policy_features(arm, dimension):
-    features = env_to_policy_features(DoorEnvConfig(arm=arm))
+def test_type_is_registered_with_its_features(arm, dimension):
+    config = make_env_config("door", arm=arm)
+    assert isinstance(config, DoorEnvConfig)
+    assert (config.type, config.task, config.fps) == ("door", "all", 10)
+    features = env_to_policy_features(config)
     assert {key: (feature.type, feature.shape) for key, feature in features.items()} == {
         "action": (FeatureType.ACTION, (dimension,)),
         "observation.state": (FeatureType.STATE, (dimension,)),
@@ -100,33 +110,26 @@ def test_bad_fields_are_refused(field, value, allowed):
         ("hold_seconds", 20),
     ],
 )
-def test_the_environment_takes_the_extremes_that_the_configuration_allows(field, value):
-    (tasks,) = make_env(DoorEnvConfig(task="push", **{field: value}), n_envs=1).values()
-    assert tasks[0].get_attr(field) == (value,)
-    tasks[0].close()
+def test_the_environment_takes_the_extremes_that_the_configuration_allows(make, field, value):
+    assert make(task="push", **{field: value})["door_push"].get_attr(field) == (value,)
 
 
 @pytest.mark.parametrize(
     ("task", "wanted"), [("all", ["push", "pull", "slide"]), ("pull, push", ["pull", "push"]), ("slide", ["slide"])]
 )
-def test_each_kind_has_a_suite_of_its_own(task, wanted):
-    suites = make_env(DoorEnvConfig(task=task), n_envs=1)
-    kinds = {name: tasks[0].reset(seed=0)[1]["door_kind"][0] for name, tasks in suites.items()}
+def test_each_kind_has_a_suite_of_its_own(make, task, wanted):
+    kinds = {name: env.reset(seed=0)[1]["door_kind"][0] for name, env in make(task=task).items()}
     assert list(kinds.items()) == [(f"door_{kind}", kind) for kind in wanted]
-    for tasks in suites.values():
-        tasks[0].close()
 
 
-def test_random_draws_kinds_by_the_seed():
-    (tasks,) = make_env(DoorEnvConfig(task="random"), n_envs=1).values()
-    kinds = {tasks[0].reset(seed=seed, options={"lerobot_new_rollout": True})[1]["door_kind"][0] for seed in range(12)}
+def test_random_draws_kinds_by_the_seed(make):
+    env = make(task="random")["door_random"]
+    kinds = {env.reset(seed=seed, options={"lerobot_new_rollout": True})[1]["door_kind"][0] for seed in range(12)}
     assert kinds == {"push", "pull", "slide"}
-    tasks[0].close()
 
 
-def test_observations_and_time_limit():
-    (tasks,) = make_env(DoorEnvConfig(task="push", episode_length=3), n_envs=2).values()
-    env = tasks[0]
+def test_observations_and_time_limit(make):
+    env = make(2, task="push", episode_length=3)["door_push"]
     observation, _ = env.reset(seed=[1, 2])
     batch = preprocess_observation(observation)
     assert batch["observation.images.front"].shape == (2, 3, 128, 128)
@@ -135,14 +138,11 @@ def test_observations_and_time_limit():
     assert env.call("_max_episode_steps") == (3, 3)
     truncations = [env.step(observation["agent_pos"])[3].tolist() for _ in range(3)]
     assert truncations == [[False] * 2, [False] * 2, [True] * 2]
-    env.close()
 
 
-def test_rollout_of_lerobot_eval_sees_success_and_failure(tmp_path):
+def test_rollout_of_lerobot_eval_sees_success_and_failure(tmp_path, make):
     log = tmp_path / "trials.jsonl"
-    config = DoorEnvConfig(task="pull", episode_length=130, trial_log=str(log))
-    (tasks,) = make_env(config, n_envs=3).values()
-    env = tasks[0]
+    env = make(3, task="pull", episode_length=130, trial_log=str(log))["door_pull"]
     assert isinstance(env, gym.vector.SyncVectorEnv)
     # Straight away, after a wrong try, and not at all: only the last one runs into the time limit.
     evaluations = []
@@ -154,29 +154,23 @@ def test_rollout_of_lerobot_eval_sees_success_and_failure(tmp_path):
         assert result["action"].shape == (3, 130, 7)
         evaluations.append(sorted(read_trials(log), key=lambda trial: trial.seed))
         log.unlink()
-    env.close()
     trials = evaluations[0]
     assert trials == evaluations[1]
-    assert [trial.seed for trial in trials] == [7, 8, 9]
-    assert [(trial.first_try, trial.recovered, trial.success) for trial in trials] == [
-        (True, False, True),
-        (False, True, True),
-        (False, False, False),
+    assert [(trial.seed, trial.door_kind, trial.attempts, trial.success) for trial in trials] == [
+        (7, "pull", ("pull",), True),
+        (8, "pull", ("push", "pull"), True),
+        (9, "pull", (), False),
     ]
     assert trials[0].steps < trials[1].steps < trials[2].steps == 130
-    assert trials[1].attempts == ("push", "pull")
-    assert {trial.door_kind for trial in trials} == {"pull"}
     # The steps of the log are those at which the roll-out was done.
     assert [int(done.int().argmax()) + 1 for done in result["done"]] == [trial.steps for trial in trials]
 
 
-def test_rollout_of_lerobot_eval_logs_the_hold(tmp_path):
+def test_rollout_of_lerobot_eval_logs_the_hold(tmp_path, make):
     """One trial is held and opened, the other never begins to open: their infos must go into one batch."""
     log = tmp_path / "trials.jsonl"
-    config = DoorEnvConfig(task="push", episode_length=120, hold_seconds=3.0, trial_log=str(log))
-    (tasks,) = make_env(config, n_envs=2).values()
-    run(tasks[0], [("push",)], seeds=[7, 8])
-    tasks[0].close()
+    env = make(2, task="push", episode_length=120, hold_seconds=3.0, trial_log=str(log))["door_push"]
+    run(env, [("push",)], seeds=[7, 8])
     opened, untouched = sorted(read_trials(log), key=lambda trial: trial.seed)
     assert opened.opened_after_hold
     assert 65 <= opened.held_at <= 75
@@ -185,13 +179,10 @@ def test_rollout_of_lerobot_eval_logs_the_hold(tmp_path):
 
 
 @pytest.mark.slow
-def test_asynchronous_environments_run_in_processes(tmp_path):
+def test_asynchronous_environments_run_in_processes(tmp_path, make):
     log = tmp_path / "trials.jsonl"
-    config = DoorEnvConfig(task="slide", episode_length=2, trial_log=str(log))
-    (tasks,) = make_env(config, n_envs=2, use_async_envs=True).values()
-    env = tasks[0]
+    env = make(2, use_async_envs=True, task="slide", episode_length=2, trial_log=str(log))["door_slide"]
     observation, _ = env.reset(seed=[1, 2], options={"lerobot_new_rollout": True})
     for _ in range(4):
         observation = env.step(observation["agent_pos"])[0]
-    env.close()
     assert sorted(trial.seed for trial in read_trials(log)) == [1, 2]

@@ -1,6 +1,7 @@
 """What a recording holds, and what it must not tell."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -8,10 +9,6 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames, encode_video_frames
 from PIL import Image
-from sklearn.linear_model import LogisticRegression
-from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 from env_door import recording
 from env_door.demonstration import demonstrate, spread
@@ -23,17 +20,19 @@ CAMERA = "observation.images.front"
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper"]
 
 
+def open_dataset(config, **options):
+    return LeRobotDataset(config.repo_id, root=config.root, video_backend="pyav", **options)
+
+
 @pytest.fixture(scope="module")
 def dataset(recording):
-    config, _ = recording
-    return LeRobotDataset(config.repo_id, root=config.root, video_backend="pyav", return_uint8=True)
+    return open_dataset(recording[0], return_uint8=True)
 
 
 @pytest.fixture(scope="module")
 def episodes(dataset, recording):
     """Decoded images `(E, T, H, W, 3)`, states `(E, T, D)` and actions `(E, T, D)`."""
     config, _ = recording
-    shape = (config.total_episodes, config.num_steps)
     table = dataset.hf_dataset.with_format("numpy")
     images = []
     for episode in range(config.total_episodes):
@@ -41,31 +40,34 @@ def episodes(dataset, recording):
         times = [first + step / 10 for step in range(config.num_steps)]
         path = dataset.root / dataset.meta.get_video_file_path(episode, CAMERA)
         images.append(decode_video_frames(path, times, 1e-4, "pyav", return_uint8=True).permute(0, 2, 3, 1).numpy())
-    return (
-        np.stack(images),
-        np.stack(table["observation.state"]).reshape(*shape, -1),
-        np.stack(table["action"]).reshape(*shape, -1),
-    )
+    vectors = [np.split(np.stack(table[key]), config.total_episodes) for key in ("observation.state", "action")]
+    return tuple(np.stack(values) for values in (images, *vectors))
 
 
 def test_features_are_those_of_the_real_robot(dataset):
     names = [f"{joint}.pos" for joint in JOINTS]
-    for key in ("observation.state", "action"):
-        assert dataset.features[key]["names"] == names
-        assert dataset.features[key]["shape"] == (7,)
-    assert dataset.features[CAMERA]["shape"] == (128, 128, 3)
-    assert dataset.features[CAMERA]["names"] == ["height", "width", "channels"]
+    for key, shape, parts in (
+        ("observation.state", (7,), names),
+        ("action", (7,), names),
+        (CAMERA, (128, 128, 3), ["height", "width", "channels"]),
+    ):
+        assert (dataset.features[key]["shape"], dataset.features[key]["names"]) == (shape, parts)
     assert (dataset.fps, dataset.meta.robot_type) == (10, "ur5e_robotiq")
     assert list(dataset.meta.tasks.index) == ["open the door"]
 
 
-def test_report_describes_the_dataset(dataset, recording):
+def test_report_and_provenance_describe_the_dataset_and_no_frame_does(dataset, recording):
     config, report = recording
-    assert dataset.num_episodes == report.total_episodes == len(report.episodes) == 9
+    assert dataset.num_episodes == len(report.episodes) == 9
     assert dataset.num_frames == 9 * config.num_steps
     assert [episode["kind"] for episode in report.episodes] == ["push", "pull", "slide"] * 3
     assert [episode["episode_index"] for episode in report.episodes] == list(range(9))
     assert all(episode["branch_step"] < episode["success_step"] < config.num_steps for episode in report.episodes)
+    provenance = json.loads((config.root / "meta" / "door_recording.json").read_text())
+    assert provenance["episodes"] == [{"kind": e["kind"], "seed": e["seed"]} for e in report.episodes]
+    assert set(dataset[0]) == {CAMERA, "observation.state", "action", "task"} | {
+        *("task_index", "timestamp", "frame_index", "episode_index", "index")
+    }
 
 
 def test_dataset_holds_what_the_expert_did(dataset, recording, episodes):
@@ -89,20 +91,14 @@ def test_items_are_single_frames_and_whole_episodes(dataset, recording, episodes
     assert item["task"] == "open the door"
     np.testing.assert_array_equal(item[CAMERA].permute(1, 2, 0).numpy(), episodes[0][1, 7])
     steps = [step / 10 for step in range(config.num_steps)]
-    windows = LeRobotDataset(
-        config.repo_id,
-        root=config.root,
-        video_backend="pyav",
-        delta_timestamps={CAMERA: steps, "action": steps},
-        return_uint8=True,
-    )
-    item = windows[2 * config.num_steps]
+    windows = {CAMERA: steps, "action": steps}
+    item = open_dataset(config, delta_timestamps=windows, return_uint8=True)[2 * config.num_steps]
     np.testing.assert_array_equal(item[CAMERA].permute(0, 2, 3, 1).numpy(), episodes[0][2])
     np.testing.assert_array_equal(item["action"].numpy(), episodes[2][2])
     assert not item["action_is_pad"].any()
 
 
-def test_decoded_dataset_is_the_same_for_every_kind_before_the_branch(recording, episodes):
+def test_decoded_dataset_is_bit_identical_for_every_kind_before_the_branch_and_not_after(recording, episodes):
     _, report = recording
     images, states, actions = episodes
     for index, episode in enumerate(report.episodes):
@@ -110,26 +106,8 @@ def test_decoded_dataset_is_the_same_for_every_kind_before_the_branch(recording,
         np.testing.assert_array_equal(actions[index, :branch], actions[twin, :branch])
         np.testing.assert_array_equal(states[index, : branch + 1], states[twin, : branch + 1])
         np.testing.assert_array_equal(images[index, : branch + 1], images[twin, : branch + 1])
-
-
-def kind_accuracy(recording, episodes, offsets):
-    """Leave-one-seed-out accuracy at telling the kind from frames and joints some steps from the branch."""
-    _, report = recording
-    images, states, _ = episodes
-    inputs, kinds, seeds = [], [], []
-    for index, episode in enumerate(report.episodes):
-        for offset in offsets:
-            step = episode["branch_step"] + offset
-            inputs.append(np.concatenate([images[index, step, ::4, ::4].ravel() / 255, states[index, step]]))
-            kinds.append(episode["kind"])
-            seeds.append(episode["seed"])
-    classifier = make_pipeline(StandardScaler(), LogisticRegression(max_iter=200))
-    return cross_val_score(classifier, np.stack(inputs), kinds, groups=seeds, cv=LeaveOneGroupOut()).mean()
-
-
-def test_a_classifier_finds_the_kind_after_the_branch_only(recording, episodes):
-    assert kind_accuracy(recording, episodes, range(-40, 1, 4)) == pytest.approx(1 / 3)
-    assert kind_accuracy(recording, episodes, range(20, 40, 4)) > 0.9
+        opening = images[[index, twin], branch + 20].astype(int)
+        assert index == twin or (np.abs(opening[0] - opening[1]).max(axis=-1) > 30).mean() > 0.02
 
 
 def test_later_frames_leave_no_trace_in_the_video_of_earlier_ones(tmp_path, recording):
@@ -157,22 +135,10 @@ def test_later_frames_leave_no_trace_in_the_video_of_earlier_ones(tmp_path, reco
     assert decoded_difference(RGBEncoderConfig(vcodec="h264", g=50, crf=23)) > 10
 
 
-def test_provenance_names_seeds_and_kinds_but_no_frame_does(recording, dataset):
-    config, report = recording
-    provenance = json.loads((config.root / "meta" / "door_recording.json").read_text())
-    assert provenance["episodes"] == [{"kind": e["kind"], "seed": e["seed"]} for e in report.episodes]
-    assert set(dataset[0]) == {CAMERA, "observation.state", "action", "task", "task_index"} | {
-        "timestamp",
-        "frame_index",
-        "episode_index",
-        "index",
-    }
-
-
 def test_panda_has_its_own_joints(tmp_path):
     config = RecordConfig("tester/panda", root=tmp_path / "door", episodes_per_kind=1, kinds=["pull"], arm="panda")
     record(config)
-    dataset = LeRobotDataset(config.repo_id, root=config.root, video_backend="pyav")
+    dataset = open_dataset(config)
     names = [f"joint_{number}.pos" for number in range(1, 8)] + ["gripper.pos"]
     assert dataset.features["action"]["names"] == dataset.features["observation.state"]["names"] == names
     assert dataset.meta.robot_type == "panda"
@@ -188,6 +154,7 @@ def test_matched_demonstrations_spread_the_door_and_others_draw_it(tmp_path, mon
 
     monkeypatch.setattr(recording, "demonstrate", fail)
     config = RecordConfig("me/door", root=tmp_path / "data", door_offset=0.02, matched=matched)
-    with pytest.raises(RuntimeError, match="failed at 20 seeds"):
+    with pytest.raises(RuntimeError, match="failed at 20 seeds in a row, 19 the last"):
         record(config)
     assert asked == [(seed, 0.02 * spread(seed) if matched else None) for seed in range(20)]
+    assert os.listdir(tmp_path) == [], "nothing is left of a recording in which the expert never succeeds"

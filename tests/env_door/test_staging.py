@@ -10,34 +10,32 @@ def contents(folder):
     return {str(path.relative_to(folder)): path.read_text() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_first_change_makes_the_directory(tmp_path):
+@pytest.mark.parametrize("is_there", [False, True])
+def test_first_change_makes_the_directory_or_fills_an_empty_one(tmp_path, is_there):
     root = tmp_path / "deep" / "root"
+    if is_there:
+        root.mkdir(parents=True)
     with StagedDirectory(root) as directory, directory.change() as staged:
         assert not staged.exists()
         staged.mkdir()
         (staged / "a").write_text("1")
-        assert not root.exists()
-    assert contents(root.parent) == {"root/a": "1"}
+        assert root.exists() == is_there
+    assert contents(tmp_path) == {"deep/root/a": "1"}
 
 
-def test_empty_directory_counts_as_absent(tmp_path):
-    root = tmp_path / "root"
-    root.mkdir()
-    with StagedDirectory(root) as directory, directory.change() as staged:
-        assert not staged.exists()
-        staged.mkdir()
-        (staged / "a").write_text("1")
-    assert contents(tmp_path) == {"root/a": "1"}
+@pytest.fixture
+def root(tmp_path):
+    """A directory to change."""
+    (tmp_path / "root" / "meta").mkdir(parents=True)
+    (tmp_path / "root" / "meta" / "info").write_text("old")
+    (tmp_path / "root" / "data").write_text("kept")
+    return tmp_path / "root"
 
 
 @pytest.mark.parametrize("can_exchange", [True, False])
-def test_change_replaces_the_directory(tmp_path, monkeypatch, can_exchange):
+def test_change_replaces_the_directory(tmp_path, root, monkeypatch, can_exchange):
     if not can_exchange:
         monkeypatch.setattr("env_door.staging.exchange", lambda first, second: False)
-    root = tmp_path / "root"
-    (root / "meta").mkdir(parents=True)
-    (root / "meta" / "info").write_text("old")
-    (root / "data").write_text("kept")
     with StagedDirectory(root) as directory, directory.change() as staged:
         (staged / "meta" / "info").write_text("new")
         (staged / "more").write_text("added")
@@ -46,11 +44,7 @@ def test_change_replaces_the_directory(tmp_path, monkeypatch, can_exchange):
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_failed_change_leaves_everything_as_it_was(tmp_path, error):
-    root = tmp_path / "root"
-    (root / "meta").mkdir(parents=True)
-    (root / "meta" / "info").write_text("old")
-
+def test_failed_change_leaves_everything_as_it_was(tmp_path, root, error):
     def change_half():
         with StagedDirectory(root) as directory, directory.change() as staged:
             (staged / "meta" / "info").write_text("half")
@@ -58,7 +52,7 @@ def test_failed_change_leaves_everything_as_it_was(tmp_path, error):
 
     with pytest.raises(type(error)):
         change_half()
-    assert contents(tmp_path) == {"root/meta/info": "old"}
+    assert contents(tmp_path) == {"root/meta/info": "old", "root/data": "kept"}
     assert os.listdir(tmp_path) == ["root"]
 
 
@@ -72,29 +66,24 @@ def test_temporary_files_are_made_inside_and_removed(tmp_path):
     assert os.listdir(tmp_path) == ["root"]
 
 
-def test_leftovers_of_a_killed_process_are_cleared(tmp_path):
-    root = tmp_path / "root"
-    root.mkdir()
-    (root / "a").write_text("whole")
+def test_leftovers_of_a_killed_process_are_cleared(tmp_path, root):
     half = tmp_path / ".root.staging" / "staged"
     half.mkdir(parents=True)
-    (half / "a").write_text("half")
+    (half / "data").write_text("half")
     with StagedDirectory(root) as directory, directory.change() as staged:
-        assert contents(staged) == {"a": "whole"}
-    assert contents(tmp_path) == {"root/a": "whole"}
+        assert contents(staged) == {"meta/info": "old", "data": "kept"}
+    assert contents(tmp_path) == {"root/meta/info": "old", "root/data": "kept"}
 
 
-def test_directory_set_aside_by_a_killed_process_comes_back(tmp_path):
-    previous = tmp_path / ".root.staging" / "previous"
-    previous.mkdir(parents=True)
-    (previous / "a").write_text("whole")
-    with StagedDirectory(tmp_path / "root"):
+def test_directory_set_aside_by_a_killed_process_comes_back(tmp_path, root):
+    (tmp_path / ".root.staging").mkdir()
+    root.rename(tmp_path / ".root.staging" / "previous")
+    with StagedDirectory(root):
         pass
-    assert contents(tmp_path) == {"root/a": "whole"}
+    assert contents(tmp_path) == {"root/meta/info": "old", "root/data": "kept"}
 
 
-def test_second_writer_is_refused(tmp_path):
-    root = tmp_path / "root"
+def test_second_writer_is_refused(root):
     with StagedDirectory(root), pytest.raises(BlockingIOError, match="Another process"), StagedDirectory(root):
         pass
     with StagedDirectory(root):

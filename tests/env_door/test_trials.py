@@ -47,79 +47,67 @@ def trial(attempts, success=True):
 
 
 @pytest.mark.parametrize(
-    ("attempts", "success", "first_try", "recovered", "first_try_wrong"),
+    ("attempts", "success", "first_try", "first_try_wrong"),
     [
-        (("push",), True, True, False, False),
-        (("pull", "push"), True, False, True, True),
-        (("push", "slide", "push"), True, False, True, False),
-        (("pull", "slide"), False, False, False, True),
-        (("push",), False, False, False, False),
-        ((), False, False, False, False),
+        (("push",), True, True, False),
+        (("pull", "push"), True, False, True),
+        (("push", "slide", "push"), True, False, False),
+        (("pull", "slide"), False, False, True),
+        (("push",), False, False, False),
+        ((), False, False, False),
     ],
 )
-def test_first_tries_and_recoveries(attempts, success, first_try, recovered, first_try_wrong):
+def test_first_tries(attempts, success, first_try, first_try_wrong):
     seen = trial(attempts, success)
-    assert (seen.first_try, seen.recovered, seen.first_try_wrong) == (first_try, recovered, first_try_wrong)
+    assert (seen.first_try, seen.first_try_wrong) == (first_try, first_try_wrong)
 
 
-def test_success_and_time_limit_are_logged_once_each(tmp_path):
-    path = tmp_path / "logs" / "trials.jsonl"
+def play(env, seed, num_steps=5):
+    env.reset(seed=seed)
+    for _ in range(num_steps):
+        env.step(np.zeros(1))
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "logs" / "trials.jsonl"
+
+
+def test_success_and_time_limit_are_logged_once_each_and_an_abandoned_trial_is_not(path):
     env = TrialLog(gym.wrappers.TimeLimit(ScriptedDoor(("pull", "push")), 7), path)
-    env.reset(seed=3)
-    for _ in range(9):  # goes on after success and past the time limit
-        env.step(np.zeros(1))
-    env = TrialLog(gym.wrappers.TimeLimit(ScriptedDoor(), 4), path)
-    env.reset()
-    for _ in range(4):
-        env.step(np.zeros(1))
+    play(env, seed=2, num_steps=1)
+    play(env, seed=3, num_steps=9)  # goes on after success and past the time limit
+    play(TrialLog(gym.wrappers.TimeLimit(ScriptedDoor(), 4), path), seed=None, num_steps=4)
     opened, cut = read_trials(path)
     assert opened == Trial(3, "push", True, 5, ("pull", "push"), 1.0, 0.01)
     assert cut == Trial(None, "push", False, 4, (), 0.8, 0.01)
 
 
-def test_a_hold_is_logged_with_what_was_tried_meanwhile(tmp_path):
-    path = tmp_path / "trials.jsonl"
+def test_a_hold_is_logged_with_what_was_tried_meanwhile(path):
     env = TrialLog(gym.wrappers.TimeLimit(ScriptedDoor(held=(2, 3)), 5), path)
-    for seed in (1, 2):
-        env.reset(seed=seed)
-        for _ in range(5):
-            env.step(np.zeros(1))
+    play(env, seed=1)
+    play(env, seed=2)
     for seen in read_trials(path):
         assert (seen.held_at, seen.tried_while_held, seen.opened_after_hold) == (2, ("slide",), True)
 
 
-def test_a_log_from_before_there_were_holds_is_read(tmp_path):
-    path = tmp_path / "trials.jsonl"
+def write(path, *lines):
+    path.parent.mkdir()
+    path.write_text("\n".join(lines), errors="surrogateescape")
+
+
+def test_a_log_from_before_there_were_holds_is_read(path):
     fields = asdict(trial(("push",)))
     del fields["held_at"], fields["tried_while_held"]
-    path.write_text(json.dumps(fields))
+    write(path, json.dumps(fields))
     (old,) = read_trials(path)
     assert old == trial(("push",))
     assert (old.held_at, old.tried_while_held, old.opened_after_hold) == (None, (), False)
 
 
-def test_abandoned_trial_is_not_logged(tmp_path):
-    path = tmp_path / "trials.jsonl"
-    env = TrialLog(ScriptedDoor(), path)
-    env.reset(seed=1)
-    env.step(np.zeros(1))
-    env.reset(seed=2)
-    for _ in range(5):
-        env.step(np.zeros(1))
-    assert [(seen.seed, seen.steps) for seen in read_trials(path)] == [(2, 5)]
-
-
-def test_parallel_writers_do_not_mix_lines(tmp_path):
-    path = tmp_path / "trials.jsonl"
-
-    def run(seed):
-        env = TrialLog(ScriptedDoor(("pull", "slide") * 500), path)
-        env.reset(seed=seed)
-        for _ in range(5):
-            env.step(np.zeros(1))
-
+def test_parallel_writers_do_not_mix_lines(path):
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(run, range(64)))
+        list(pool.map(lambda seed: play(TrialLog(ScriptedDoor(("pull", "slide") * 500), path), seed), range(64)))
     assert sorted(seen.seed for seen in read_trials(path)) == list(range(64))
 
 
@@ -134,22 +122,20 @@ GOOD_LINE = json.dumps(asdict(trial(("push",))))
         "\udcff",
     ],
 )
-def test_broken_line_is_named(tmp_path, line):
-    path = tmp_path / "trials.jsonl"
-    path.write_text(GOOD_LINE + "\n" + line + "\n", errors="surrogateescape")
+def test_broken_line_is_named(path, line):
+    write(path, GOOD_LINE, line)
     with pytest.raises(ValueError, match="line 2"):
         read_trials(path)
 
 
-def test_missing_log_is_an_error(tmp_path):
+def test_missing_log_is_an_error(path):
     with pytest.raises(FileNotFoundError):
-        read_trials(tmp_path / "none.jsonl")
+        read_trials(path)
 
 
-def test_a_log_of_two_evaluations_is_refused(tmp_path):
+def test_a_log_of_two_evaluations_is_refused(path):
     """An interrupted evaluation that was started again must not count its trials twice."""
-    path = tmp_path / "trials.jsonl"
-    path.write_text(GOOD_LINE + "\n" + GOOD_LINE.replace('"push"', '"pull"') + "\n" + GOOD_LINE + "\n")
+    write(path, GOOD_LINE, GOOD_LINE.replace('"push"', '"pull"'), GOOD_LINE)
     with pytest.raises(ValueError, match=r"line 3 repeats the trial push, seed \d+: .* more than one evaluation"):
         read_trials(path)
 
