@@ -1,7 +1,7 @@
 """Where the arm is, asked of the digital twin by the real client of `ur_rtde`, and of sockets that talk nonsense."""
 
 import socket
-import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,20 +9,20 @@ import pytest
 import teleoperators_fakes as fakes
 from waiting import wait_until
 
-from lerobot_ufrnn.teleoperators import ArmStateError, SpaceMouseTwistConfig, arm_state
-from lerobot_ufrnn.teleoperators.arm_state import RTDE_PORT, ArmState
+from lerobot_ufrnn.teleoperators import SpaceMouseTwistConfig, arm_state
+from lerobot_ufrnn.teleoperators.arm_state import RTDE_PORT, ArmState, ArmStateError
 
 
-def make_arm(address, **settings):
-    return ArmState(SpaceMouseTwistConfig(robot_ip=address, **settings))
+def make_arm(address, clock=time.monotonic, **settings):
+    return ArmState(SpaceMouseTwistConfig(robot_ip=address, **settings), clock)
 
 
 @pytest.fixture
 def twin():
     pytest.importorskip("rtde_receive", reason="needs the extra `ur5e`")
-    from env_door.twin import TwinProcess, free_address
+    from env_door.twin import TwinProcess
 
-    with TwinProcess(address=free_address(), kind="push", seed=3) as twin:
+    with TwinProcess(kind="push", seed=3) as twin:
         yield twin
 
 
@@ -72,7 +72,7 @@ def test_silence_before_the_first_look_and_nonsense_are_told_too(monkeypatch, jo
     monkeypatch.setattr(arm_state, "import_client", lambda _: (None, library, None))
     clock = fakes.Clock()
     with socket.create_server(("127.0.0.9", RTDE_PORT)):
-        arm = ArmState(SpaceMouseTwistConfig(robot_ip="127.0.0.9"), clock)
+        arm = make_arm("127.0.0.9", clock)
         arm.open()
     clock.now += later
     with pytest.raises(ArmStateError, match=told):
@@ -85,31 +85,26 @@ def test_without_a_controller_it_says_which_flag_to_look_at():
         make_arm("127.0.0.10").open()
 
 
-def answer_gripper(answer):
-    """A gripper that gives one answer; returns its port."""
-    server = socket.create_server(("127.0.0.1", 0))
-
-    def serve():
-        connection, _ = server.accept()
-        assert connection.recv(64) == b"GET PRE\n"
-        connection.sendall(answer)
-        connection.close()
-        server.close()
-
-    threading.Thread(target=serve, daemon=True).start()
-    return server.getsockname()[1]
+@pytest.fixture
+def gripper(monkeypatch):
+    monkeypatch.setattr(arm_state, "TIMEOUT_SECONDS", 0.3)
+    gripper = fakes.FakeGripper()
+    yield gripper
+    gripper.close()
 
 
 @pytest.mark.parametrize(("reading", "closure"), [(3, 0.0), (0, 0.0), (230, 1.0), (255, 1.0), (117, 114 / 227)])
-def test_the_grippers_target_is_read_from_its_socket(reading, closure):
-    arm = make_arm("127.0.0.1", gripper_port=answer_gripper(f"PRE {reading}".encode()))
-    assert arm.gripper_target() == pytest.approx(closure)
+def test_the_grippers_target_is_read_from_its_socket(gripper, reading, closure):
+    gripper.values["PRE"] = reading
+    assert make_arm("127.0.0.1", gripper_port=gripper.port).gripper_target() == pytest.approx(closure)
+    assert gripper.commands == ["GET PRE"]
 
 
 @pytest.mark.parametrize("answer", [b"", b"?", b"POS 3", b"PRE x", b"\xff\xfe"])
-def test_a_gripper_that_talks_nonsense_is_told(answer):
+def test_a_gripper_that_talks_nonsense_is_told(gripper, answer):
+    gripper.answer = answer
     with pytest.raises(ArmStateError, match=r"--teleop\.gripper_port=0"):
-        make_arm("127.0.0.1", gripper_port=answer_gripper(answer)).gripper_target()
+        make_arm("127.0.0.1", gripper_port=gripper.port).gripper_target()
 
 
 def test_no_gripper_counts_as_open():

@@ -7,7 +7,8 @@ import pytest
 from teleoperators_fakes import Clock
 from waiting import wait_until
 
-from lerobot_ufrnn.teleoperators import DeviceLostError, DeviceUnavailableError, SpaceMouseTwistConfig
+from lerobot_ufrnn.teleoperators import SpaceMouseTwistConfig
+from lerobot_ufrnn.teleoperators.device import DeviceLostError, DeviceUnavailableError
 from lerobot_ufrnn.teleoperators.spacemouse import SpaceMouseDevice
 
 
@@ -51,13 +52,8 @@ def mouse(monkeypatch):
 
 
 @pytest.fixture
-def clock():
-    return Clock()
-
-
-@pytest.fixture
-def device(mouse, clock):
-    device = make_device(clock, deadzone=0.2)
+def device(mouse):
+    device = make_device(Clock(), deadzone=0.2)
     device.open()
     yield device
     device.close()
@@ -72,12 +68,12 @@ def test_the_axes_of_ros_are_asked_for_and_small_deflections_are_none(device, mo
     np.testing.assert_allclose(device.read().twist, [0.5, 0, 0, 1, -1, 0], atol=1e-12)
 
 
-def test_a_deflection_that_is_not_repeated_fades_but_a_button_stays(device, mouse, clock):
+def test_a_deflection_that_is_not_repeated_fades_but_a_button_stays(device, mouse):
     mouse.report = report(1.0, (1, 0, 0, 0, 0, 0), (1, 0))
     wait_until(lambda: device.read().twist.any())
-    clock.now += 0.19
+    device._clock.now += 0.19
     assert device.read().twist[0] == 1
-    clock.now += 0.02
+    device._clock.now += 0.02
     state = device.read()
     assert not state.twist.any()
     assert state.buttons == {"close"}
@@ -103,6 +99,7 @@ def test_an_unplugged_mouse_is_told(device, mouse):
         (RuntimeError("HID API is probably not installed."), "libhidapi-hidraw0"),
         (RuntimeError("Failed to open device"), "udev"),
         (RuntimeError("No connected or supported devices found."), "plug one in"),
+        (OSError("cannot load library"), "libhidapi-hidraw0"),
     ],
 )
 def test_what_is_missing_is_told_with_its_remedy(mouse, fault, remedy):
@@ -125,18 +122,11 @@ class FakeHid:
 
     def __init__(self, *reports):
         self.reports = [bytes(report) for report in reports]
-
-    def open(self):
-        pass
-
-    def set_nonblocking(self, _):
-        pass
+        self.open = self.close = lambda: None
+        self.set_nonblocking = lambda _: None
 
     def read(self, _):
         return self.reports.pop(0) if self.reports else b""
-
-    def close(self):
-        pass
 
 
 def words(channel, *values):
