@@ -7,8 +7,6 @@ import threading
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_ufrnn.teleoperators.device import DeviceState, TwistDevice
-
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 FEATURES = [f"{name}.pos" for name in (*JOINTS, "gripper")]
 READY = np.array([2.80, -1.60, 1.57, 0.03, 1.23, 1.57])
@@ -49,6 +47,9 @@ class FakeArmState:
     def open(self):
         self.is_open = True
 
+    def close(self):
+        self.is_open = False
+
     def joints(self):
         if self.fault is not None:
             raise self.fault
@@ -56,29 +57,6 @@ class FakeArmState:
 
     def gripper_target(self):
         return self.gripper
-
-    def close(self):
-        self.is_open = False
-
-
-class ScriptedDevice(TwistDevice):
-    """Gives what a test put into `state`; raises `fault`, if there is one."""
-
-    def __init__(self):
-        self.state = DeviceState()
-        self.is_open = False
-        self.fault: Exception | None = None
-
-    def open(self):
-        self.is_open = True
-
-    def read(self):
-        if self.fault is not None:
-            raise self.fault
-        return self.state
-
-    def close(self):
-        self.is_open = False
 
 
 class FakeGripper:
@@ -114,10 +92,5 @@ class FakeGripper:
             self.values["STA"] = 3
         return b"ack"
 
-    def close(self) -> None:
+    def close(self):
         self._listener.close()
-
-
-def fail(error):
-    """Raises, where a lambda stands in for something that fails."""
-    raise error

@@ -17,47 +17,30 @@ def make_arm(address, clock=time.monotonic, **settings):
     return ArmState(SpaceMouseTwistConfig(robot_ip=address, **settings), clock)
 
 
-@pytest.fixture
-def twin():
-    pytest.importorskip("rtde_receive", reason="needs the extra `ur5e`")
-    from env_door.twin import TwinProcess
-
-    with TwinProcess(kind="push", seed=3) as twin:
-        yield twin
-
-
-@pytest.fixture
-def arm(twin):
-    arm = make_arm(twin.address)
-    arm.open()
-    yield arm
-    arm.close()
-    arm.close()
-
-
-@pytest.mark.real_time
-def test_joints_are_the_controllers_and_follow_it(twin, arm):
-    def agree():
-        state = twin.state()["joints"]
-        return np.allclose(arm.joints(), [state[name] for name in fakes.JOINTS], atol=1e-3)
-
-    wait_until(agree)
-    before = arm.joints()
-    twin.reset("push", 4)
-    wait_until(lambda: agree() and np.abs(arm.joints() - before).max() > 0.01)
-
-
 @pytest.mark.real_time
 @pytest.mark.parametrize(
     ("injection", "told"), [("freeze", r"has sent nothing for 0\.|broke"), ("drop_link", "start the command again")]
 )
-def test_a_controller_that_falls_silent_or_away_is_told_although_the_client_goes_on_answering(
-    twin, arm, injection, told
-):
-    arm.joints()
-    twin.inject(injection)
-    with pytest.raises(ArmStateError, match=told):
-        wait_until(lambda: arm.joints() is None, 3.0)
+def test_joints_are_the_controllers_until_it_falls_silent_or_away(injection, told):
+    pytest.importorskip("rtde_receive", reason="needs the extra `ur5e`")
+    from env_door.twin import TwinProcess
+
+    def agree():
+        state = twin.state()["joints"]
+        return np.allclose(arm.joints(), [state[name] for name in fakes.JOINTS], atol=1e-3)
+
+    with TwinProcess(kind="push", seed=3) as twin:
+        arm = make_arm(twin.address)
+        arm.open()
+        wait_until(agree)
+        before = arm.joints()
+        twin.reset("push", 4)
+        wait_until(lambda: agree() and np.abs(arm.joints() - before).max() > 0.01)
+        twin.inject(injection)
+        with pytest.raises(ArmStateError, match=told):  # although the client goes on answering
+            wait_until(lambda: arm.joints() is None, 3.0)
+        arm.close()
+        arm.close()
 
 
 @pytest.mark.parametrize(
