@@ -1,3 +1,4 @@
+import contextlib
 import sys
 import time
 from types import SimpleNamespace
@@ -16,10 +17,9 @@ def make_device(clock=time.monotonic, **settings):
     return SpaceMouseDevice(SpaceMouseTwistConfig(robot_ip="192.0.2.1", **settings), clock)
 
 
-def report(t, twist=(0, 0, 0, 0, 0, 0), buttons=(0, 0)):
+def report(t, x=0, y=0, z=0, roll=0, pitch=0, yaw=0, buttons=(0, 0)):
     """What the mouse says; `t` tells a new report from an old one."""
-    axes = dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), twist, strict=True))
-    return SimpleNamespace(t=t, buttons=list(buttons), **axes)
+    return SimpleNamespace(t=t, x=x, y=y, z=z, roll=roll, pitch=pitch, yaw=yaw, buttons=list(buttons))
 
 
 class FakeLibrary:
@@ -63,13 +63,13 @@ def device(mouse):
 def test_the_axes_of_ros_are_asked_for_and_small_deflections_are_none(device, mouse):
     assert mouse.asked == ["ros"]
     assert not device.read().twist.any()
-    mouse.report = report(1.0, (0.6, -0.2, 0.1, 1.2, -1.0, 0.0))
+    mouse.report = report(1.0, 0.6, -0.2, 0.1, 1.2, -1.0)
     wait_until(lambda: device.read().twist.any())
     np.testing.assert_allclose(device.read().twist, [0.5, 0, 0, 1, -1, 0], atol=1e-12)
 
 
 def test_a_deflection_that_is_not_repeated_fades_but_a_button_stays(device, mouse):
-    mouse.report = report(1.0, (1, 0, 0, 0, 0, 0), (1, 0))
+    mouse.report = report(1.0, x=1, buttons=(1, 0))
     wait_until(lambda: device.read().twist.any())
     device._clock.now += 0.19
     assert device.read().twist[0] == 1
@@ -77,13 +77,13 @@ def test_a_deflection_that_is_not_repeated_fades_but_a_button_stays(device, mous
     state = device.read()
     assert not state.twist.any()
     assert state.buttons == {"close"}
-    mouse.report = report(2.0, (1, 0, 0, 0, 0, 0), (0, 1))
+    mouse.report = report(2.0, x=1, buttons=(0, 1))
     wait_until(lambda: device.read().buttons == {"open"})
     assert device.read().twist[0] == 1
 
 
 def test_a_value_that_is_no_number_is_passed_on_to_be_seen(device, mouse):
-    mouse.report = report(1.0, (float("nan"), 0, 0, 0, 0, 0))
+    mouse.report = report(1.0, x=float("nan"))
     wait_until(lambda: device.read().fault() is not None)
 
 
@@ -148,17 +148,10 @@ def words(channel, *values):
 )
 def test_raw_reports_become_axes_of_ros_in_the_real_library(monkeypatch, raw, axis, direction):
     pyspacemouse = pytest.importorskip("pyspacemouse", reason="needs the extra `spacemouse`")
-    from pyspacemouse import api
-
     hid = FakeHid(raw, [3, 2, 0, 0, 0, 0, 0])
     hid.vendor_id, hid.product_id = pyspacemouse.get_device_specs()["SpaceMouseCompact"].hid_id
-    monkeypatch.setattr(api, "Enumeration", lambda: SimpleNamespace(find=lambda: [hid]))
-    device = make_device(deadzone=0.0, stale_after=1.0)
-    device.open()
-    try:
+    monkeypatch.setattr(pyspacemouse.api, "Enumeration", lambda: SimpleNamespace(find=lambda: [hid]))
+    with contextlib.closing(make_device(deadzone=0.0, stale_after=1.0)) as device:
+        device.open()
         wait_until(lambda: device.read().buttons == {"open"})
-        expected = np.zeros(6)
-        expected[axis] = direction
-        np.testing.assert_allclose(device.read().twist, expected, atol=1e-12)
-    finally:
-        device.close()
+        np.testing.assert_allclose(device.read().twist, direction * np.eye(6)[axis], atol=1e-12)
