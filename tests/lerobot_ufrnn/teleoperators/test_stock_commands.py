@@ -37,6 +37,7 @@ class World:
 
     def open(self):
         self.order.append("teleoperator connected")
+        self.arm.is_open = True
 
     def start(self):
         self.order.append("robot connected")
