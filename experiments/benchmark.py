@@ -11,6 +11,8 @@ import itertools
 import json
 import sys
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,12 +24,16 @@ import torch
 from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from script import run
 from timing import describe_machine, one_core, take_turns, text, write
 from torch import Tensor
 
 from env_door.checks import check_range
-from lerobot_ufrnn.commands.flags import parse_flags
+from env_door.configuration_door import DoorEnvConfig
+from env_door.env import DoorEnv
+from env_door.expert import DoorExpert
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig, ForesightConfig, RecallConfig, UFRNNConfig
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
@@ -44,12 +50,23 @@ FEATURES: dict[str, Any] = {
     "device": "cpu",
 }
 # Stated, so that another default does not change what is measured. The scan knows these readings of the paper only.
-READINGS: dict[str, Any] = {"num_samples": 5, "horizon": 10, "horizon_mode": "fixed", "noise_unit": "std"}
-READINGS |= {"noise_scale": "linear", "perturbed_states": "hidden"}
-READINGS |= {"variance_baseline": "common", "variance_aggregation": "variance"}
-SIZES: dict[str, Any] = {"joint_hidden_dim": 50, "image_hidden_dim": 50, "shared_hidden_dim": 20}
+READINGS = ForesightConfig(
+    num_samples=5,
+    horizon=10,
+    horizon_mode="fixed",
+    noise_unit="std",
+    noise_scale="linear",
+    perturbed_states="hidden",
+    variance_baseline="common",
+    variance_aggregation="variance",
+)
 PAPER = UFRNNConfig(
-    foresight=ForesightConfig(**READINGS), autoencoder=AutoencoderConfig(feature_dim=10), **SIZES, **FEATURES
+    joint_hidden_dim=50,
+    image_hidden_dim=50,
+    shared_hidden_dim=20,
+    foresight=READINGS,
+    autoencoder=AutoencoderConfig(feature_dim=10),
+    **FEATURES,
 )
 BATCH_SIZE, LENGTH = 5, 149  # an episode of 150 frames has 149 next ones to predict
 FAST, REFERENCE, SCAN = "fast kernel", "readable code", "XLA scan"
@@ -108,17 +125,15 @@ def make_scan_update(config: UFRNNConfig = PAPER, batch_size: int = BATCH_SIZE, 
     model = make_model(UFRNN, config)
     episodes = [scan.jnp.array(part.transpose(0, 1).numpy()) for part in make_episodes(config, batch_size, length)]
     state = scan.start_adam({name: value.detach().numpy() for name, value in model.network.named_parameters()})
-    schedule = model.foresight.schedule
+    schedule, scan_update = model.foresight.schedule, scan.make_update(config)
     noise_bounds = scan.jnp.array(np.stack((schedule.low.numpy(), schedule.high.numpy())))
-    sizes = scan.ScanSizes.of(config)
     shape = (length, config.foresight.num_samples, batch_size, sum(model.network.state_sizes[::2]))
     generator = torch.Generator().manual_seed(0)
 
     def update() -> float:
         nonlocal state
         noise = torch.randn(shape, generator=generator).numpy()
-        rate, clip_norm = config.optimizer_lr, config.optimizer_grad_clip_norm
-        state, loss = scan.update(state, *episodes, noise, noise_bounds, sizes, rate, clip_norm)
+        state, loss = scan_update(state, *episodes, noise, noise_bounds)
         return float(loss)
 
     return update
@@ -162,20 +177,10 @@ def make_ufrnn(kernel: str, recall: bool = False) -> UFRNNPolicy:
     return policy.eval()
 
 
-def make_act() -> PreTrainedPolicy:
-    """LeRobot's ACT with default settings and random weights."""
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    return ACTPolicy(ACTConfig(pretrained_backbone_weights=None, **FEATURES)).eval()
-
-
-def make_diffusion() -> PreTrainedPolicy:
-    """LeRobot's Diffusion Policy with default settings and random weights; an ImportError without `diffusers`."""
-    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
-    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-
-    return DiffusionPolicy(DiffusionConfig(pretrained_backbone_weights=None, **FEATURES)).eval()
+def make_other(name: str) -> PreTrainedPolicy:
+    """LeRobot's `act` or `diffusion` with default settings and random weights; an ImportError without `diffusers`."""
+    config = make_policy_config(name, pretrained_backbone_weights=None, **FEATURES)
+    return get_policy_class(name)(config).eval()
 
 
 def time_ticks(policies: dict[str, PreTrainedPolicy], seconds: float, min_rounds: int, warm_up: int = 1):
@@ -213,13 +218,13 @@ def of_acting(seconds: float) -> pd.DataFrame:
     the longest of each chunk, for UF-RNN the longest of 100; amortised is the mean over it. With recall the worst tick
     is one that goes back and imagines.
     """
-    policies: dict[str, PreTrainedPolicy] = {"ACT": make_act()}
+    policies: dict[str, PreTrainedPolicy] = {"ACT": make_other("act")}
     policies["UF-RNN, foresight at each step, fast kernel"] = make_ufrnn("fast")
     policies["UF-RNN, foresight at each step, readable code"] = make_ufrnn("reference")
     policies["UF-RNN, recall, going back whenever it can"] = make_ufrnn("fast", recall=True)
     times = time_ticks(policies, seconds, min_rounds=10)
     try:
-        times |= time_ticks({"Diffusion Policy": make_diffusion()}, 0, min_rounds=1, warm_up=0)  # about a minute
+        times |= time_ticks({"Diffusion Policy": make_other("diffusion")}, 0, min_rounds=1, warm_up=0)  # about a minute
     except ImportError as error:
         print(f"No comparison with Diffusion Policy: {error}", file=sys.stderr)
     return pd.DataFrame(
@@ -243,18 +248,15 @@ def of_growth(seconds: float) -> pd.DataFrame:
 
     The exponent is the slope of log time over log size for the three largest.
     """
-
-    def imagining(**fields: Any) -> dict[str, Any]:
-        return {"config": replace(PAPER, foresight=replace(PAPER.foresight, **fields))}
-
+    foresight, hidden_dims = PAPER.foresight, ((25, 10), (50, 20), (100, 40), (200, 80))
     sizes: dict[str, dict[int, dict[str, Any]]] = {
-        "N": {num_samples: imagining(num_samples=num_samples) for num_samples in (1, 2, 5, 10, 20)},
-        "T": {horizon: imagining(horizon=horizon) for horizon in (1, 5, 10, 20, 40)},
+        "N": {n: {"config": replace(PAPER, foresight=replace(foresight, num_samples=n))} for n in (1, 2, 5, 10, 20)},
+        "T": {t: {"config": replace(PAPER, foresight=replace(foresight, horizon=t))} for t in (1, 5, 10, 20, 40)},
         "batch": {size: {"batch_size": size} for size in (1, 2, 5, 10, 20)},
         "L": {length: {"length": length} for length in (50, 100, 149, 300, 600)},
         "hidden size": {
-            joint: {"config": replace(PAPER, joint_hidden_dim=joint, image_hidden_dim=joint, shared_hidden_dim=shared)}
-            for joint, shared in ((25, 10), (50, 20), (100, 40), (200, 80))
+            lower: {"config": replace(PAPER, joint_hidden_dim=lower, image_hidden_dim=lower, shared_hidden_dim=shared)}
+            for lower, shared in hidden_dims
         },
     }
     rows = []
@@ -268,9 +270,51 @@ def of_growth(seconds: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+# ── The door ──────────────────────────────────────────────────────────
+
+
+def of_environment(seconds: float, batch_size: int = 5, asynchronous: tuple[bool, ...] = (False, True)) -> pd.DataFrame:
+    """Steps a second of the door while the gripper holds the knob, which is slower than free movement."""
+    with ExitStack() as stack:
+        env = DoorEnv(start_variation=0.0)
+        stack.callback(env.close)
+        env.reset(seed=0, options={"kind": "slide"})
+        expert = DoorExpert(env, ("push",))
+        expert.reset(np.random.default_rng(0))
+        actions = []
+        for _ in range(expert.branch_step):  # to the knob, gripped and twisted
+            actions.append(expert.act())
+            env.advance(actions[-1])
+        calls: dict[str, Callable[[], object]] = {
+            "physics only": lambda: env.advance(actions[-1]),
+            f"with {env.observation_size} px picture": lambda: env.step(actions[-1]),
+            f"and {env.render_size} px video frame": lambda: (env.step(actions[-1]), env.render()),
+        }
+        for in_processes in asynchronous:
+            # No episode may end while it is measured: LeRobot's finished environments cost nothing.
+            config = DoorEnvConfig(task="slide", episode_length=10**9, start_variation=0.0)
+            ((batch,),) = (tasks.values() for tasks in config.create_envs(batch_size, in_processes).values())
+            stack.callback(batch.close)
+            batch.reset(seed=0)
+            for action in actions:
+                batch.step(np.stack([action] * batch_size))
+            name = f"batch of {batch_size}, {'async' if in_processes else 'sync'}"
+            calls[name] = partial(batch.step, np.stack([actions[-1]] * batch_size))
+        times = take_turns(calls, seconds, warm_up=3)
+    speeds = {name: 1e3 * (batch_size if name.startswith("batch") else 1) / times[name] for name in calls}
+    return pd.DataFrame(
+        {"what": name, "steps a second": text(speed), "calls": len(times)} for name, speed in speeds.items()
+    )
+
+
 # ── The command ───────────────────────────────────────────────────────
 
-PARTS = {"update": of_update, "acting": of_acting, "growth": of_growth}
+PARTS: dict[str, Callable[[float], pd.DataFrame]] = {
+    "update": of_update,
+    "acting": of_acting,
+    "growth": of_growth,
+    "environment": of_environment,
+}
 
 
 @dataclass
@@ -309,11 +353,8 @@ def quick_figures(seconds: float = 4.0, rounds: int = 10, **problem) -> dict[str
     return {name: None if value is None else round(float(value), 4) for name, value in figures.items()}
 
 
-def main(arguments: list[str]) -> None:
+def main(config: BenchmarkConfig) -> None:
     """Measures, prints and writes."""
-    config = parse_flags(
-        BenchmarkConfig, ["--quick=true" if word == "--quick" else word for word in arguments], "benchmark.py"
-    )
     if config.quick:
         print(", ".join(f"{name} {value}" for name, value in describe_machine().items()), flush=True)
         print(json.dumps(quick_figures()), flush=True)
@@ -323,7 +364,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"benchmark.py: {error}")
+    run(main, BenchmarkConfig, ["--quick=true" if word == "--quick" else word for word in sys.argv[1:]])

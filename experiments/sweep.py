@@ -16,8 +16,6 @@ import os
 import shutil
 import signal
 import string
-import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,8 +24,9 @@ from typing import Any
 
 import pandas as pd
 from draccus.utils import ParsingError
-from epochs import Model, Schedule, read_model
+from epochs import Model, find_checkpoints, read_model
 from jobs import locked, replace_text, run_command, stop
+from script import run
 from tables import HELD_COUNTS, KEY, RESULTS, SUCCESS_COUNTS, describe, read_table
 
 from env_door.checks import check_range
@@ -35,7 +34,6 @@ from env_door.latch import KINDS, check_kinds
 from env_door.limits import MAX_HOLD, MAX_OFFSET
 from env_door.trials import first_of_each_kind, read_trials
 from lerobot_ufrnn.analysis.results import count_by_door
-from lerobot_ufrnn.commands.flags import parse_flags
 
 # Nothing here imports LeRobot or PyTorch: their memory would lie idle while the commands need it.
 PROVENANCE_PATH = Path("meta/door_recording.json")  # where the recorder keeps its settings; it imports LeRobot
@@ -173,8 +171,9 @@ class Network:
 
     config: SweepConfig
     model: Model
-    schedule: Schedule
     seed: int
+    step_of: dict[int, int]  # epochs to try, and the updates that end them
+    save_freq: int  # updates between checkpoints
 
     @property
     def name(self) -> str:
@@ -185,17 +184,6 @@ class Network:
     def folder(self) -> Path:
         """Everything that it leaves, but for its rows of the table."""
         return self.config.output_dir / self.model.name / f"seed{self.seed}"
-
-    @property
-    def epochs(self) -> list[int]:
-        """Checkpoints to try."""
-        return sorted(self.config.epochs) or [self.schedule.last_epoch]
-
-    @property
-    def save_freq(self) -> int:
-        """Updates between checkpoints."""
-        wanted = self.model.settings.get("save_freq") or 0
-        return self.schedule.save_freq(self.epochs, wanted if wanted > 0 else self.schedule.steps)
 
     @property
     def checkpoints(self) -> dict[int, Path]:
@@ -220,11 +208,21 @@ class Network:
 
     def run(self) -> list[str]:
         """Trains, then tries one checkpoint after the other; returns what failed."""
+        failures = []
         with locked(self.folder / "lock") as lock:
-            if not _attempt(f"{self.name}: training", lambda: self.train(lock)):
-                return [f"{self.name}: training"]
-            tries = {f"{self.name}: trials {self.config.trials} of epoch {epoch}": epoch for epoch in self.epochs}
-            return [name for name, epoch in tries.items() if not _attempt(name, partial(self.evaluate, epoch, lock))]
+            work = {f"{self.name}: training": partial(self.train, lock)}
+            for epoch in self.step_of:
+                work[f"{self.name}: trials {self.config.trials} of epoch {epoch}"] = partial(self.evaluate, epoch, lock)
+            for name, do in work.items():
+                try:
+                    do()
+                    print(f"[{name}] is done", flush=True)
+                except (RuntimeError, ValueError, OSError) as error:
+                    print(f"[{name}] failed: {error}", flush=True)
+                    failures.append(name)
+                    if name.endswith("training"):
+                        break
+        return failures
 
     def train(self, lock: int) -> None:
         """Trains, from the last checkpoint on if there is one, unless it is done."""
@@ -233,7 +231,7 @@ class Network:
         settings["dataset_size"] = count_demonstrations(self.config.demonstrations)
         claim(self.folder / "train.json", settings)
         folder, step = self.folder / "train", self.last_checkpoint
-        if step == self.schedule.steps:
+        if step == self.model.settings["steps"]:
             return
         if step > 0:
             flags = {"config_path": self.checkpoints[step] / "pretrained_model" / "train_config.json", "resume": "true"}
@@ -251,8 +249,7 @@ class Network:
         claim(log.parent.with_suffix(".json"), config.policy_flags)
         if self.missing_trials(epoch):
             shutil.rmtree(log.parent, ignore_errors=True)
-            step = self.schedule.step_of(epoch)
-            if step not in self.checkpoints:
+            if (step := self.step_of[epoch]) not in self.checkpoints:
                 raise FileNotFoundError(
                     f"{self.folder} has no checkpoint of epoch {epoch} (update {step}); it has those of updates "
                     f"{list(self.checkpoints)}. Choose among them, or delete that folder to train again."
@@ -292,15 +289,13 @@ class Network:
 
 def plan(config: SweepConfig, models: list[Model]) -> list[Network]:
     """All networks, every model with the first seed before any with the second; the demonstrations exist."""
-    size, networks = count_demonstrations(config.demonstrations), []
-    for seed in config.train_seeds:
-        for model in models:
-            try:
-                networks.append(Network(config, model, Schedule.of(model.settings, *size), seed))
-                _ = networks[-1].save_freq
-            except ValueError as error:
-                raise ValueError(f"Model {model.name}: {error}") from error
-    return networks
+    size, checkpoints = count_demonstrations(config.demonstrations), {}
+    for model in models:
+        try:
+            checkpoints[model.name] = find_checkpoints(model.settings, *size, config.epochs)
+        except ValueError as error:
+            raise ValueError(f"Model {model.name}: {error}") from error
+    return [Network(config, model, seed, *checkpoints[model.name]) for seed in config.train_seeds for model in models]
 
 
 # ── Files ─────────────────────────────────────────────────────────────
@@ -332,19 +327,8 @@ def claim(file: Path, request: dict[str, Any]) -> None:
 # ── The command ───────────────────────────────────────────────────────
 
 
-def _attempt(name: str, work: Callable[[], None]) -> bool:
-    try:
-        work()
-    except (RuntimeError, ValueError, OSError) as error:
-        print(f"[{name}] failed: {error}", flush=True)
-        return False
-    print(f"[{name}] is done", flush=True)
-    return True
-
-
-def main(arguments: list[str]) -> None:
+def main(config: SweepConfig) -> None:
     """Does what is not done yet, and prints the table; a RuntimeError if something failed, with the rest done."""
-    config = parse_flags(SweepConfig, arguments, "sweep.py")
     if config.table.exists():
         read_table(config.table, config.counts)  # refuses another kind of table before the work
     models = [read_model(path) for path in config.models]
@@ -365,9 +349,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"sweep.py: {error}")
-    except KeyboardInterrupt:
-        sys.exit("sweep.py: stopped; run it again to go on")
+    run(main, SweepConfig)

@@ -11,10 +11,12 @@ ever differs.
 """
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -37,7 +39,7 @@ HELD_RATES = {
     "of these, opened in 30 s": ("opened_after_hold", "held"),
     "of these, tried another way meanwhile": ("tried_another_way", "held"),
 }
-Rates = dict[str, tuple[str, str]]
+SAME = 1e-9  # difference in percentage points from which rates differ
 
 
 @dataclass
@@ -73,7 +75,7 @@ def read_table(path: Path, counts: Sequence[str] | None = None) -> pd.DataFrame:
     return table
 
 
-def rates_of(table: pd.DataFrame) -> Rates:
+def rates_of(table: pd.DataFrame) -> dict[str, tuple[str, str]]:
     """Which counts of a table make a rate: heading to part and whole."""
     return HELD_RATES if "held" in table else SUCCESS_RATES
 
@@ -85,12 +87,11 @@ def rates_of_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> pd
     return pd.DataFrame({name: 100 * counts[part] / counts[whole] for name, (part, whole) in rates_of(table).items()})
 
 
-def interval(rates: Sequence[float]) -> tuple[float, float] | None:
-    """95 % t-interval of the mean of rates in percent, clipped to what it can be; None if they do not differ."""
-    if len(set(rates)) < 2:
+def interval(values: pd.Series, lowest: float = 0.0) -> tuple[float, float] | None:
+    """95 % t-interval of a mean in percent, clipped to what it can be; None where values do not differ."""
+    if len(values) < 2 or np.ptp(values) < SAME:
         return None
-    low, high = stats.t.interval(0.95, len(rates) - 1, loc=np.mean(rates), scale=stats.sem(rates))
-    return max(0.0, float(low)), min(100.0, float(high))
+    return _clip(stats.ttest_1samp(values, 0), lowest)
 
 
 def interval_of_difference(rates: pd.Series, others: pd.Series, paired: bool) -> tuple[float, float] | None:
@@ -99,16 +100,16 @@ def interval_of_difference(rates: pd.Series, others: pd.Series, paired: bool) ->
     `paired` if networks of the same seed are the same networks that act in another way; otherwise it is Welch's.
     """
     if paired:
-        gaps = (rates - others).dropna()
-        spread, freedom = gaps.std() / np.sqrt(len(gaps)), len(gaps) - 1
-    else:
-        shares = np.array([group.var() / len(group) for group in (rates, others)])
-        spread = np.sqrt(shares.sum())
-        freedom = shares.sum() ** 2 / sum(shares**2 / [len(rates) - 1, len(others) - 1]) if spread > 0 else 0
-    if not spread > 0:
+        return interval((rates - others).dropna(), lowest=-100)
+    if max(np.ptp(rates), np.ptp(others)) < SAME:
         return None
-    low, high = stats.t.interval(0.95, freedom, loc=rates.mean() - others.mean(), scale=spread)
-    return max(-100.0, float(low)), min(100.0, float(high))
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # networks of one model may not differ
+        return _clip(stats.ttest_ind(rates, others, equal_var=False), lowest=-100)
+
+
+def _clip(test: Any, lowest: float) -> tuple[float, float]:
+    low, high = np.clip(test.confidence_interval(0.95), lowest, 100)
+    return float(low), float(high)
 
 
 def summarize_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> pd.DataFrame:
@@ -119,7 +120,7 @@ def summarize_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> p
     summary = groups[first].apply(lambda each: ", ".join(map(_number, each))).to_frame(f"{first}: each")
     for name in rates:
         summary[f"{name}: mean" if name == first else name] = groups[name].apply(
-            lambda each: _text(each.mean(), interval(list(each.dropna())))
+            lambda each: _text(each.mean(), interval(each.dropna()))
         )
     last = table[table.epoch == table.groupby("model").epoch.transform("max")]
     of_network = last.groupby([*by, "train_seed"]).trials.sum().groupby(list(by))

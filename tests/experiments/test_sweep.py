@@ -11,12 +11,13 @@ import jobs
 import pytest
 import sweep
 import yaml
-from sweep import PROVENANCE_PATH, Network, SweepConfig, main, plan, read_model, record_missing
+from sweep import PROVENANCE_PATH, Network, SweepConfig, plan, read_model, record_missing
 from tables import RESULTS, read_table
 
 from env_door import provenance
 from env_door.latch import KINDS
 from env_door.trials import Trial
+from lerobot_ufrnn.commands.flags import parse_flags
 
 MODEL = """
 policy: {type: ufrnn, autoencoder: {steps: 4}}
@@ -278,6 +279,10 @@ def test_a_data_set_of_somebody_else_is_left_alone(config, fake):
 
 
 # ── The command ───────────────────────────────────────────────────────
+
+
+def main(flags: list[str]) -> None:
+    sweep.main(parse_flags(SweepConfig, flags, "sweep.py"))
 
 
 def flags_for(config: SweepConfig) -> list[str]:

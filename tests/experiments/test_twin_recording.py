@@ -28,7 +28,7 @@ class Stage:
 
     def __init__(self, *ends):
         self.ends, self.takes, self.flags = list(ends), [], []
-        self.process, self.now, self.returncode = self, "", 0
+        self.now, self.returncode = "", 0
 
     def __call__(self, *arguments, TMPDIR=None, **_):  # noqa: N803
         if TMPDIR:
