@@ -12,7 +12,6 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,9 +30,6 @@ from timing import describe_machine, one_core, take_turns, text, write
 from torch import Tensor
 
 from env_door.checks import check_range
-from env_door.configuration_door import DoorEnvConfig
-from env_door.env import DoorEnv
-from env_door.expert import DoorExpert
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig, ForesightConfig, RecallConfig, UFRNNConfig
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
@@ -270,65 +266,19 @@ def of_growth(seconds: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-# ── The door ──────────────────────────────────────────────────────────
-
-
-def of_environment(seconds: float, batch_size: int = 5, asynchronous: tuple[bool, ...] = (False, True)) -> pd.DataFrame:
-    """Steps a second of the door while the gripper holds the knob, which is slower than free movement."""
-    with ExitStack() as stack:
-        env = DoorEnv(start_variation=0.0)
-        stack.callback(env.close)
-        env.reset(seed=0, options={"kind": "slide"})
-        expert = DoorExpert(env, ("push",))
-        expert.reset(np.random.default_rng(0))
-        actions = []
-        for _ in range(expert.branch_step):  # to the knob, gripped and twisted
-            actions.append(expert.act())
-            env.advance(actions[-1])
-        calls: dict[str, Callable[[], object]] = {
-            "physics only": lambda: env.advance(actions[-1]),
-            f"with {env.observation_size} px picture": lambda: env.step(actions[-1]),
-            f"and {env.render_size} px video frame": lambda: (env.step(actions[-1]), env.render()),
-        }
-        for in_processes in asynchronous:
-            # No episode may end while it is measured: LeRobot's finished environments cost nothing.
-            config = DoorEnvConfig(task="slide", episode_length=10**9, start_variation=0.0)
-            ((batch,),) = (tasks.values() for tasks in config.create_envs(batch_size, in_processes).values())
-            stack.callback(batch.close)
-            batch.reset(seed=0)
-            for action in actions:
-                batch.step(np.stack([action] * batch_size))
-            name = f"batch of {batch_size}, {'async' if in_processes else 'sync'}"
-            calls[name] = partial(batch.step, np.stack([actions[-1]] * batch_size))
-        times = take_turns(calls, seconds, warm_up=3)
-    speeds = {name: 1e3 * (batch_size if name.startswith("batch") else 1) / times[name] for name in calls}
-    return pd.DataFrame(
-        {"what": name, "steps a second": text(speed), "calls": len(times)} for name, speed in speeds.items()
-    )
-
-
 # ── The command ───────────────────────────────────────────────────────
 
-PARTS: dict[str, Callable[[float], pd.DataFrame]] = {
-    "update": of_update,
-    "acting": of_acting,
-    "growth": of_growth,
-    "environment": of_environment,
-}
+PARTS: dict[str, Callable[[float], pd.DataFrame]] = {"update": of_update, "acting": of_acting, "growth": of_growth}
 
 
 @dataclass
 class BenchmarkConfig:
     """What to measure."""
 
-    quick: bool = False
-    """Only the update and `select_action`, under a minute; the last line is a JSON object and nothing is written."""
-    parts: tuple[str, ...] = tuple(PARTS)
-    """Tables to make."""
-    seconds: float = 60.0
-    """Time for each part, after compiling; Diffusion Policy takes a minute more."""
-    output_dir: Path = Path("outputs/benchmark")
-    """Folder for a `.md` and a `.json` file of each part."""
+    quick: bool = False  # only update and `select_action`, under a minute; ends in a JSON object, writes nothing
+    parts: tuple[str, ...] = tuple(PARTS)  # tables to make
+    seconds: float = 60.0  # time for each part, after compiling; Diffusion Policy takes a minute more
+    output_dir: Path = Path("outputs/benchmark")  # folder for a `.md` and a `.json` file of each part
 
     def __post_init__(self) -> None:
         if not self.parts or not set(self.parts) <= set(PARTS):

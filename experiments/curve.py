@@ -21,10 +21,8 @@ from lerobot_ufrnn.analysis.colors import DOOR_COLORS
 class CurveConfig:
     """What to draw."""
 
-    results: Path = RESULTS / "door_protocol.csv"
-    """Table that `sweep.py` wrote."""
-    output: Path = RESULTS / "success_curve.png"
-    """Picture to write."""
+    results: Path = RESULTS / "door_protocol.csv"  # table that `sweep.py` wrote
+    output: Path = RESULTS / "success_curve.png"  # picture to write
 
 
 def draw(table: pd.DataFrame, path: Path) -> None:

@@ -38,8 +38,7 @@ class ResolverConfig:
         default_factory=lambda: [*(f"lerobot[{name}]" for name in EXTRAS), *SIMULATORS.split(), *PLUG_INS.split()]
     )
     """Requirements to resolve beside this package; all known ones when not given."""
-    output: Path = ROOT / "experiments" / "results" / "resolver.md"
-    """File for the table."""
+    output: Path = ROOT / "experiments" / "results" / "resolver.md"  # file for the table
 
 
 def resolve(uv: str, requirements: list[str], python: str) -> tuple[dict[str, str], str]:

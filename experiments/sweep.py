@@ -48,40 +48,23 @@ FREE_SETTINGS = ("save_freq", "log_freq", "output_dir", "job_name", "seed")  # m
 class SweepConfig:
     """What to train, and how to try it."""
 
-    models: list[Path]
-    """Files for `lerobot-train --config_path`, of any type of policy; the name of a file is the name of the model."""
-    train_seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
-    """Seeds of training; each model is trained with each of them."""
-    epochs: list[int] = field(default_factory=list)
-    """Checkpoints to try, in passes over the demonstrations; the last one when empty."""
-    trials_per_kind: int = 100
-    """Trials for each kind of door at each checkpoint."""
-    trial_seed: int = 10000
-    """Seed of the first trial; the others count up from it, the same for every network."""
-    hold_seconds: float = 0.0
-    """Interference: for how long somebody holds the door still once it has begun to open."""
-    variant: str = ""
-    """Name of what `policy_flags` change, in the table `<model>+<variant>`."""
-    policy_flags: dict[str, Any] = field(default_factory=dict)
-    """Fields of the policy to change in the trials only, such as `{recall.enabled: false}`: nothing is trained anew."""
-    kinds: tuple[str, ...] = KINDS
-    """Kinds of door, in demonstrations and trials."""
-    episodes_per_kind: int = 5
-    """Demonstrations for each kind of door."""
-    matched: bool = True
-    """Whether the kinds share start poses and timing; unmatched, as a human's are, these may tell them apart."""
-    num_steps: int = 150
-    """Steps of a demonstration; the demonstrator needs up to 102, or 99 without sliding doors."""
-    door_offset: float = 0.0
-    """Half-width in metres of the range of the door's lateral shift, in demonstrations and trials."""
-    output_dir: Path = Path("outputs/sweep")
-    """Folder of checkpoints, trial logs and the output of every command."""
-    dataset_dir: Path | None = None
-    """Demonstrations, recorded if missing (into `output_dir` when not given); those of others are taken as they are."""
-    results: Path | None = None
-    """Table to add to; it does not say which trials were run, so that others than by default need one of their own."""
-    workers: int = os.cpu_count() or 1
-    """Networks that are trained and tried side by side, with one thread each."""
+    models: list[Path]  # files for `lerobot-train --config_path`; a model has the name of its file
+    train_seeds: list[int] = field(default_factory=lambda: [0, 1, 2])  # each model is trained with each seed
+    epochs: list[int] = field(default_factory=list)  # checkpoints to try, in passes over the data; else the last one
+    trials_per_kind: int = 100  # trials for each kind of door at each checkpoint
+    trial_seed: int = 10000  # seed of the first trial; the others count up from it, the same for every network
+    hold_seconds: float = 0.0  # interference: for how long somebody holds the door still once it has begun to open
+    variant: str = ""  # name of what `policy_flags` change, in the table `<model>+<variant>`
+    policy_flags: dict[str, Any] = field(default_factory=dict)  # changes in the trials: `{recall.enabled: false}`
+    kinds: tuple[str, ...] = KINDS  # kinds of door, in demonstrations and trials
+    episodes_per_kind: int = 5  # demonstrations for each kind of door
+    matched: bool = True  # whether the kinds share start poses and timing, which may tell them apart otherwise
+    num_steps: int = 150  # steps of a demonstration; the demonstrator needs up to 102, or 99 without sliding doors
+    door_offset: float = 0.0  # half-width in m of the range of the door's lateral shift, demonstrations and trials
+    output_dir: Path = Path("outputs/sweep")  # folder of checkpoints, trial logs and the output of every command
+    dataset_dir: Path | None = None  # demonstrations, recorded if missing; by default in `output_dir`
+    results: Path | None = None  # table to add to; it does not say which trials were run: others need another one
+    workers: int = os.cpu_count() or 1  # networks that are trained and tried side by side, with one thread each
 
     def __post_init__(self) -> None:
         for name in ("models", "train_seeds", "epochs"):

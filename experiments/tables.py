@@ -46,8 +46,7 @@ SAME = 1e-9  # difference in percentage points from which rates differ
 class TablesConfig:
     """What to print."""
 
-    results: list[Path] = field(default_factory=lambda: sorted(RESULTS.glob("*.csv")))
-    """Tables that `sweep.py` wrote; all of `experiments/results` when not given."""
+    results: list[Path] = field(default_factory=lambda: sorted(RESULTS.glob("*.csv")))  # tables of `sweep.py`
 
 
 def read_table(path: Path, counts: Sequence[str] | None = None) -> pd.DataFrame:

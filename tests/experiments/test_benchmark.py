@@ -1,7 +1,6 @@
 """What the benchmark computes; not how long anything takes."""
 
 import json
-import os
 import platform
 import sys
 import time
@@ -16,7 +15,7 @@ import torch
 from benchmark import BenchmarkConfig, main, make_episodes, make_model, make_scan_update, make_update, time_ticks
 from draccus.utils import ParsingError
 from small_network import enlarge, network_config
-from timing import one_core, take_turns
+from timing import take_turns
 
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
@@ -94,13 +93,6 @@ def test_turns_go_on_until_the_time_is_over(clock):
     assert len(take_turns({"a": lambda: clock(1)}, 10, 2)) == 10
 
 
-def test_one_core_gives_the_others_back():
-    allowed = os.sched_getaffinity(0)
-    with one_core():
-        assert (len(os.sched_getaffinity(0)), torch.get_num_threads()) == (1, 1)
-    assert os.sched_getaffinity(0) == allowed
-
-
 def test_a_round_of_a_chunked_policy_begins_with_the_tick_that_computes(clock):
     class Chunked:
         config = type("Config", (), {"n_action_steps": 4})
@@ -118,14 +110,6 @@ def test_a_round_of_a_chunked_policy_begins_with_the_tick_that_computes(clock):
 
 
 # ── What is measured ──────────────────────────────────────────────────
-
-
-def test_every_way_to_run_the_door_is_measured():
-    table = benchmark.of_environment(0.5, batch_size=2, asynchronous=(False,))
-    names = ["physics only", "with 128 px picture", "and 192 px video frame", "batch of 2, sync"]
-    assert list(table.what) == names
-    assert (table.calls >= 1).all()
-    assert all(float(cell.split()[0]) > 0 for cell in table["steps a second"])
 
 
 @pytest.mark.parametrize("with_jax", [True, False])

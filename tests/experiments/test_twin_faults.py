@@ -167,40 +167,6 @@ def test_what_must_not_be_fails_the_script_after_the_table(monkeypatch, tmp_path
     assert [line.split(" | ")[0] for line in output.read_text().splitlines()[2:]] == ["| drop_link", "| delay"]
 
 
-@pytest.mark.parametrize("ends", [False, True])
-def test_an_arm_that_does_not_get_into_motion_is_told_after_so_many_starts(monkeypatch, ends):
-    starts = []
-
-    class Still:
-        address = "127.0.0.99"
-
-        def __call__(self, *flags, **_):
-            starts.extend(flags[:1])
-            return self
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
-
-        def poll(self):
-            return 1 if ends else None
-
-        def output(self):
-            return "Recording episode 1\nno arm"
-
-        def state(self):
-            return {"arm_speed": 0.01, "joints": dict.fromkeys("abcdefg", 0.0)}
-
-    for name in ("TwinProcess", "StockCommand"):
-        monkeypatch.setattr(twin_faults, name, Still())
-    monkeypatch.setattr(twin_faults, "EPISODE_SECONDS", 0.1)
-    with pytest.raises(RuntimeError, match=r"freeze could not be tried, for the arm did not (.|\n)*no arm"):
-        twin_faults.inject("freeze", seed=0, starts=2)
-    assert starts == ["lerobot-record"] * 2
-
-
 SEEN = {
     "emergency_stop": "RobotFaultError: The arm was stopped (emergency_stop)",  # and not: the gripper without power
     "servo_paused": "RobotFaultError: The arm was stopped (servo_late): the servo process hangs",
