@@ -7,13 +7,20 @@ What is compared takes turns in one process on one core, so that a busy machine 
 ratios of the pairs of each round.
 """
 
+import gc
 import itertools
 import json
+import os
+import platform
+import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +33,10 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from script import run
-from timing import describe_machine, one_core, take_turns, text, write
 from torch import Tensor
 
 from env_door.checks import check_range
+from lerobot_ufrnn.analysis.results import markdown
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig, ForesightConfig, RecallConfig, UFRNNConfig
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
@@ -46,27 +53,100 @@ FEATURES: dict[str, Any] = {
     "device": "cpu",
 }
 # Stated, so that another default does not change what is measured. The scan knows these readings of the paper only.
-READINGS = ForesightConfig(
-    num_samples=5,
-    horizon=10,
-    horizon_mode="fixed",
-    noise_unit="std",
-    noise_scale="linear",
-    perturbed_states="hidden",
-    variance_baseline="common",
-    variance_aggregation="variance",
-)
 PAPER = UFRNNConfig(
     joint_hidden_dim=50,
     image_hidden_dim=50,
     shared_hidden_dim=20,
-    foresight=READINGS,
+    foresight=ForesightConfig(
+        num_samples=5,
+        horizon=10,
+        horizon_mode="fixed",
+        noise_unit="std",
+        noise_scale="linear",
+        perturbed_states="hidden",
+        variance_baseline="common",
+        variance_aggregation="variance",
+    ),
     autoencoder=AutoencoderConfig(feature_dim=10),
     **FEATURES,
 )
 BATCH_SIZE, LENGTH = 5, 149  # an episode of 150 frames has 149 next ones to predict
 FAST, REFERENCE, SCAN = "fast kernel", "readable code", "XLA scan"
 CYCLE = 100  # ticks of UF-RNN in a round
+PACKAGES = ("torch", "numba", "jax", "diffusers", "lerobot", "mujoco", "numpy")  # whose versions matter
+
+
+# ── Timing ────────────────────────────────────────────────────────────
+
+
+def take_turns(
+    calls: Mapping[Any, Callable[[], object]], seconds: float, min_rounds: int = 3, warm_up: int = 1
+) -> pd.DataFrame:
+    """Calls each in turn, round after round, without garbage collection; milliseconds, a row a round."""
+    for call in calls.values():
+        for _ in range(warm_up):
+            call()
+    rows: list[dict[str, float]] = []
+    gc.collect()
+    gc.disable()
+    try:
+        end = time.perf_counter() + seconds
+        while len(rows) < min_rounds or time.perf_counter() < end:
+            rows.append({})
+            for name, call in calls.items():
+                start = time.perf_counter()
+                call()
+                rows[-1][name] = 1e3 * (time.perf_counter() - start)
+    finally:
+        gc.enable()
+    return pd.DataFrame(rows)
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """One core for this thread and those that it starts; the last one, since the first usually serves interrupts."""
+    torch.set_num_threads(1)
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def text(values: pd.Series) -> str:
+    """Median and middle 80 %."""
+    low, median, high = np.percentile(values, (10, 50, 90))
+    return f"{median:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def describe_machine() -> dict[str, str]:
+    """Processor, cores and versions; nothing that names the machine or its user."""
+    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    model = re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE)
+    machine = {
+        "processor": model[1] if model else platform.processor() or "unknown",
+        "AVX-512": ("yes" if " avx512f" in info else "no") if info else "unknown",
+        "cores": str(os.cpu_count()),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+    }
+    return machine | {name: version(name) if find_spec(name) else "not installed" for name in PACKAGES}
+
+
+def write(name: str, note: str | None, table: pd.DataFrame, output_dir: Path) -> None:
+    """Prints a table, and writes `<name>.md` to read and `<name>.json` to compute with."""
+    machine = describe_machine()
+    page = f"# Benchmark: {name}\n\n{', '.join(f'{key} {value}' for key, value in machine.items())}\n\n"
+    page += f"{' '.join((note or '').split())} Medians with [10th, 90th percentile].\n\n{markdown(table)}"
+    output_dir.mkdir(parents=True, exist_ok=True)
+    (output_dir / f"{name}.md").write_text(page)
+    content = {"machine": machine, "table": table.to_dict("records")}
+    (output_dir / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n")
+    print(page, flush=True)
 
 
 # ── The training update ───────────────────────────────────────────────
@@ -244,7 +324,7 @@ def of_growth(seconds: float) -> pd.DataFrame:
 
     The exponent is the slope of log time over log size for the three largest.
     """
-    foresight, hidden_dims = PAPER.foresight, ((25, 10), (50, 20), (100, 40), (200, 80))
+    foresight = PAPER.foresight
     sizes: dict[str, dict[int, dict[str, Any]]] = {
         "N": {n: {"config": replace(PAPER, foresight=replace(foresight, num_samples=n))} for n in (1, 2, 5, 10, 20)},
         "T": {t: {"config": replace(PAPER, foresight=replace(foresight, horizon=t))} for t in (1, 5, 10, 20, 40)},
@@ -252,7 +332,7 @@ def of_growth(seconds: float) -> pd.DataFrame:
         "L": {length: {"length": length} for length in (50, 100, 149, 300, 600)},
         "hidden size": {
             lower: {"config": replace(PAPER, joint_hidden_dim=lower, image_hidden_dim=lower, shared_hidden_dim=shared)}
-            for lower, shared in hidden_dims
+            for lower, shared in ((25, 10), (50, 20), (100, 40), (200, 80))
         },
     }
     rows = []

@@ -22,22 +22,21 @@ ROOT = Path(__file__).parents[1]
 PYTHONS = ("3.12", "3.13")
 # Extras of the installed LeRobot that a user would ask for; those that end so only gather dependencies of others.
 EXTRAS = [name for name in metadata("lerobot").get_all("Provides-Extra") or [] if not name.endswith("-dep")]
-SIMULATORS = "gym-hil gym-aloha gym-pusht gymnasium-robotics metaworld robosuite hf-libero mani-skill dm-control mink"
-PLUG_INS = (
-    "lerobot-env-so101 lerobot-policy-turbovla lerobot-policy-act-smooth lerobot-policy-act-ttt lerobot-policy-rewact "
-    "lerobot-robot-xarm lerobot-robot-piper lerobot-robot-seeed-b601 lerobot-teleoperator-spacemouse "
-    "lerobot-teleoperator-teleop"
-)
+# Simulators that use MuJoCo and are common beside LeRobot, then third-party plug-ins of LeRobot.
+OTHERS = """
+    gym-hil gym-aloha gym-pusht gymnasium-robotics metaworld robosuite hf-libero mani-skill dm-control mink
+    lerobot-env-so101 lerobot-policy-turbovla lerobot-policy-act-smooth lerobot-policy-act-ttt lerobot-policy-rewact
+    lerobot-robot-xarm lerobot-robot-piper lerobot-robot-seeed-b601 lerobot-teleoperator-spacemouse
+    lerobot-teleoperator-teleop
+"""
+PARTNERS = [*(f"lerobot[{name}]" for name in EXTRAS), *OTHERS.split()]
 
 
 @dataclass
 class ResolverConfig:
     """What to resolve."""
 
-    partners: list[str] = field(
-        default_factory=lambda: [*(f"lerobot[{name}]" for name in EXTRAS), *SIMULATORS.split(), *PLUG_INS.split()]
-    )
-    """Requirements to resolve beside this package; all known ones when not given."""
+    partners: list[str] = field(default_factory=lambda: PARTNERS)  # requirements to resolve beside this package
     output: Path = ROOT / "experiments" / "results" / "resolver.md"  # file for the table
 
 

@@ -176,14 +176,9 @@ class Network:
 
     @property
     def last_checkpoint(self) -> int:
-        """The last update whose checkpoint is whole, 0 if there is none.
-
-        LeRobot points the link `last` at a checkpoint once it is written; it takes the old link away just before.
-        """
-        link, steps = self.folder / "train" / "checkpoints" / "last", list(self.checkpoints)
-        if link.is_symlink():
-            return int(link.readlink().name)
-        return steps[-1] if len(steps) > 1 else 0
+        """The last update whose checkpoint is whole, to which LeRobot points the link `last`; 0 if there is none."""
+        link = self.folder / "train" / "checkpoints" / "last"
+        return int(link.readlink().name) if link.is_symlink() else 0
 
     def trial_log(self, epoch: int) -> Path:
         """Trials of an epoch's checkpoint."""

@@ -127,7 +127,6 @@ class Outcome:
     """What became of one injection."""
 
     name: str
-    injection: Injection
     speed: float  # of the fastest joint at that moment, in rad/s
     standstill: float | None  # s until the arm stood; `None` if it never did
     moved_again: bool  # once it had stood
@@ -146,7 +145,7 @@ class Outcome:
 
     def problems(self) -> list[str]:
         """What must not be, in a few words each; empty if all is well."""
-        allowed, status = self.injection, self.status or 0
+        allowed, status = INJECTIONS[self.name], self.status or 0
         resumes = allowed.release is not None
         late = self.standstill is None or self.standstill > MAX_STOP_SECONDS
         crashed = self.ended is not None and status < 0 and -status != allowed.may_die_of
@@ -169,12 +168,12 @@ class Outcome:
             return "**FAILED**: " + ", ".join(problems)
         if self.status != 0:
             return "stopped; the recording cannot be read" if self.lost else "stopped"
-        return "stopped, then went on" if self.injection.must_stop else "went on, not noticed"
+        return "stopped, then went on" if INJECTIONS[self.name].must_stop else "went on, not noticed"
 
     def row(self) -> dict[str, str]:
         """Its row of the table."""
         # When the recording went on, the arm stood at its end, which says nothing of the injection.
-        stopped = self.standstill is not None and (self.injection.must_stop or self.status != 0)
+        stopped = self.standstill is not None and (INJECTIONS[self.name].must_stop or self.status != 0)
         frames = ", ".join(map(str, self.episodes))
         return {
             "injection": self.name,
@@ -317,7 +316,6 @@ def watch(name: str, twin: TwinProcess, command: StockCommand, samples: list[Sam
         cleared.append(look(twin))
     return Outcome(
         name,
-        injection,
         speed,
         *stop_after(samples, begin),
         ended=ended,

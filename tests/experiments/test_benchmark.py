@@ -12,10 +12,18 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from benchmark import BenchmarkConfig, main, make_episodes, make_model, make_scan_update, make_update, time_ticks
+from benchmark import (
+    BenchmarkConfig,
+    main,
+    make_episodes,
+    make_model,
+    make_scan_update,
+    make_update,
+    take_turns,
+    time_ticks,
+)
 from draccus.utils import ParsingError
 from small_network import enlarge, network_config
-from timing import take_turns
 
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN

@@ -59,13 +59,6 @@ def test_stopping_ends_what_runs_and_starts_no_more(tmp_path):
     assert log(tmp_path) == "asleep\n"
 
 
-def test_a_stopped_runner_waits_for_a_lock_no_longer(tmp_path):
-    with locked(tmp_path / "lock"):
-        threading.Timer(0.1, stop).start()
-        with pytest.raises(KeyboardInterrupt), locked(tmp_path / "lock"):
-            pass
-
-
 def test_a_command_left_by_a_killed_run_keeps_its_files_locked(tmp_path, capsys):
     def work(stream) -> None:
         with pytest.raises(RuntimeError, match="status -9"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import teleoperators_fakes as fakes
 from scipy.spatial.transform import Rotation
-from scripted_operator import REST_PERIODS, TELEOPERATOR, ToolPath, events_along, plan
+from scripted_operator import TELEOPERATOR, ToolPath, events_along, plan
 from twin import write_events
 
 from env_door.env import DoorEnv
@@ -27,10 +27,6 @@ def wander(steps=40, size=0.4) -> np.ndarray:
     """Joint angles on a smooth way from one rest to another, all joints at once."""
     ease = (1 - np.cos(np.linspace(0, np.pi, steps + 1)))[:, None] / 2
     return fakes.READY + ease * size * np.array([0.5, -0.4, 0.6, 0.3, -0.5, 1.0])
-
-
-def still(steps) -> np.ndarray:
-    return np.repeat(fakes.READY[None], steps, axis=0)
 
 
 def seconds(events) -> float:
@@ -78,37 +74,6 @@ def test_played_by_the_teleoperator_the_tool_comes_to_the_end_of_its_path(play, 
     np.testing.assert_allclose(position, path.positions[-1], atol=1e-4 if jitter == 0 else 2e-3)
     assert (rotation * path.rotations[-1].inv()).magnitude() < (1e-3 if jitter == 0 else 0.01)
     assert actions[-1, 6] == pytest.approx(0.8, abs=1e-6 if jitter == 0 else 0.1 + jitter)
-
-
-def test_the_path_is_followed_too_slowly_for_any_limit_of_the_teleoperator():
-    path = path_of(wander(steps=4, size=1.0))
-    moving = [event for event in events_along(path) if event.twist.any()]
-    assert all(event.seconds == 0.1 for event in moving)
-    twists = np.array([event.twist for event in moving])
-    assert 0.9 < np.abs(twists).max() <= 0.95
-    # All of the way, none of it twice: 0.1 m/s at full deflection.
-    np.testing.assert_allclose(twists[:, :3].sum(axis=0) * 0.1 * 0.1, path.positions[-1] - path.positions[0], atol=1e-9)
-    # A wrist that trails its target by 0.1 s is led by 0.07 rad at most, even by an action after 0.15 s.
-    turn = still(5) + np.linspace(0, 1, 5)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
-    needed = 1.0 * (0.15 + 0.1) / 0.07 / 0.95
-    assert needed <= seconds(events_along(path_of(turn))[1:]) <= needed + 0.1
-    # Where no limit asks for more, a step of the path takes its period.
-    slow = events_along(path_of(wander(steps=4, size=0.001)))
-    assert [event.seconds for event in slow] == pytest.approx([0.1 * REST_PERIODS, 0.1, 0.1, 0.1, 0.1])
-
-
-def test_the_gripper_moves_for_itself_between_rests_with_one_button_at_a_time():
-    events = events_along(path_of(still(8), [0, 0.2, 0.5, 0.73, 0.73, 0.4, 0.13, 0.3]))
-    assert not any(event.twist.any() for event in events)
-    rest = ((), pytest.approx(0.3))
-    # At a stroke a second, in whole periods, rounded up: 0.73 closing, a step without anything, 0.6 opening, 0.17.
-    assert [(event.buttons, event.seconds) for event in events] == [
-        rest,
-        *(rest, (("close",), pytest.approx(0.8)), rest),
-        ((), 0.1),
-        *(rest, (("open",), pytest.approx(0.6)), rest),
-        *(rest, (("close",), pytest.approx(0.2)), rest),
-    ]
 
 
 def test_a_path_that_moves_tool_and_gripper_at_once_is_refused():

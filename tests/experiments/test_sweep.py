@@ -169,14 +169,6 @@ def test_a_killed_training_goes_on_from_its_last_whole_checkpoint(config, fake, 
     assert list(network_of(config).checkpoints)[-1] == 16
 
 
-def test_a_training_killed_while_it_moved_its_link_goes_on_too(config, fake):
-    fake.stop_at = 6
-    with pytest.raises(KeyboardInterrupt):
-        network_of(config).run()
-    (network_of(config).folder / "train" / "checkpoints" / "last").unlink()
-    assert network_of(config).last_checkpoint == 6
-
-
 @pytest.mark.parametrize("left", ["", '{"seed": 10000, "door_k'], ids=["no trials", "half a line"])
 def test_a_killed_evaluation_is_repeated_from_scratch(config, fake, left):
     network = network_of(config)
@@ -315,16 +307,6 @@ def test_the_command_goes_on_past_a_failure_and_mends_it_when_run_again(config, 
     assert fake.names == ["lerobot-train", "lerobot-eval", "lerobot-eval"]
     assert "| two | 33, 33 | 33 | 0 | 33 | 2 x 9 | 4 |" in capsys.readouterr().out
     assert len(read_table(config.results)) == 2 * 2 * 2 * 3
-
-
-def test_an_interruption_stops_the_commands(config, monkeypatch):
-    def interrupted(*arguments, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sweep, "run_command", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        main(flags_for(config))
-    assert jobs.stopping.is_set()
 
 
 def test_a_table_of_another_kind_is_refused_before_the_work(config, fake):

@@ -38,14 +38,6 @@ def test_a_command_heeds_an_interrupt_even_if_a_background_job_started_it(python
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_command_that_does_not_heed_an_interrupt_is_killed(python, monkeypatch):
-    monkeypatch.setattr(twin, "END_SECONDS", 0.2)
-    code = "import signal, time; signal.signal(2, signal.SIG_IGN); print('here', flush=True); time.sleep(60)"
-    with python(code) as command:
-        pass
-    assert command.returncode == -signal.SIGKILL
-
-
 def test_the_last_error_is_what_the_user_saw():
     output = """Traceback (most recent call last):
   File "x.py", line 3, in <module>
@@ -95,13 +87,9 @@ TRIALS = ["--policy_path=x", "--trial_log=y"]
     [
         (FaultsConfig, ["--injections=[]"], "--injections must be one or more of"),
         (FaultsConfig, ["--injections=[earthquake]"], "got ['earthquake']"),
-        (FaultsConfig, ["--seed=-1"], "`seed` must be at least 0"),
         (TrialsConfig, [*TRIALS, "--kinds=[push,push]"], "each once"),
-        (TrialsConfig, [*TRIALS, "--trials_per_kind=0"], "`trials_per_kind` must be at least 1"),
-        (TrialsConfig, [*TRIALS, "--duration=0"], "`duration` must be at most 3600 and above 0 s"),
         (TrialsConfig, [*TRIALS, "--hold_seconds=99"], "`hold_seconds` must be at least 0 and at most 60 s"),
         (RecordingConfig, [*RECORDING, "--kinds=[up]"], "kinds must be one or more of"),
-        (RecordingConfig, [*RECORDING, "--takes=0"], "`takes` must be at least 1"),
         (RecordingConfig, [*RECORDING, "--episode_seconds=nan"], "`episode_seconds` must be at least 12"),
         (RecordingConfig, ["--dataset_dir=x", "--repo_id=door"], "repo_id must read"),
     ],

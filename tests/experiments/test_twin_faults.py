@@ -55,7 +55,6 @@ def test_travel_goes_by_the_farthest_joint_in_either_direction():
 
 STOPPED = Outcome(
     name="drop_link",
-    injection=INJECTIONS["drop_link"],
     speed=0.2,
     standstill=0.31,
     moved_again=False,
@@ -67,9 +66,7 @@ STOPPED = Outcome(
     left_running=(),
     episodes=(58,),
 )
-UNNOTICED = replace(
-    STOPPED, name="dashboard_gone", injection=INJECTIONS["dashboard_gone"], status=0, message="", episodes=(60, 60)
-)
+UNNOTICED = replace(STOPPED, name="dashboard_gone", status=0, message="", episodes=(60, 60))
 
 
 @pytest.mark.parametrize(
@@ -97,7 +94,7 @@ UNNOTICED = replace(
     ],
 )
 def test_the_verdict_says_what_must_not_be_and_what_an_injection_allows(name, changes, verdict):
-    assert replace(STOPPED, name=name, injection=INJECTIONS[name], **changes).verdict == verdict
+    assert replace(STOPPED, name=name, **changes).verdict == verdict
 
 
 def test_a_row_has_what_was_measured():
