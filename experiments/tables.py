@@ -93,17 +93,20 @@ def interval(values: pd.Series, lowest: float = 0.0) -> tuple[float, float] | No
     return _clip(stats.ttest_1samp(values, 0), lowest)
 
 
-def interval_of_difference(rates: pd.Series, others: pd.Series, paired: bool) -> tuple[float, float] | None:
-    """95 % interval of the difference of two means over networks in percentage points; None where there is no spread.
+def difference(rates: pd.Series, others: pd.Series, paired: bool) -> tuple[float, tuple[float, float] | None]:
+    """Difference of two means over networks in percentage points, and its 95 % interval; None where nothing differs.
 
     `paired` if networks of the same seed are the same networks that act in another way; otherwise it is Welch's.
     """
     if paired:
-        return interval((rates - others).dropna(), lowest=-100)
-    if max(np.ptp(rates), np.ptp(others)) < SAME:
-        return None
+        gaps = (rates - others).dropna()
+        return round(gaps.mean(), 9), interval(gaps, lowest=-100)  # no difference of rounding
+    rates, others = rates.dropna(), others.dropna()
+    gap = rates.mean() - others.mean()
+    if min(len(rates), len(others)) < 2 or max(np.ptp(rates), np.ptp(others)) < SAME:
+        return gap, None
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # networks of one model may not differ
-        return _clip(stats.ttest_ind(rates, others, equal_var=False), lowest=-100)
+        return gap, _clip(stats.ttest_ind(rates, others, equal_var=False), lowest=-100)
 
 
 def _clip(test: Any, lowest: float) -> tuple[float, float]:
@@ -139,14 +142,7 @@ def differences(table: pd.DataFrame) -> pd.DataFrame:
     # From the last name back, which is `ufrnn` minus its baselines.
     for (model, rates), (other, of_other) in combinations(reversed(by_model.items()), 2):
         paired = model.split("+")[0] == other.split("+")[0]
-        cells = {
-            name: _text(
-                rates[name].mean() - of_other[name].mean(),
-                interval_of_difference(rates[name].dropna(), of_other[name].dropna(), paired),
-                "+",
-            )
-            for name in rates
-        }
+        cells = {name: _text(*difference(rates[name], of_other[name], paired), "+") for name in rates}
         rows.append({"difference": f"{model} - {other}", **cells})
     return pd.DataFrame(rows)
 

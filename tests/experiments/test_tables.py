@@ -13,9 +13,9 @@ from tables import (
     RESULTS,
     SUCCESS_COUNTS,
     TablesConfig,
+    difference,
     differences,
     interval,
-    interval_of_difference,
     main,
     read_table,
     summarize_networks,
@@ -108,18 +108,21 @@ def test_the_interval_of_a_difference_is_over_pairs_or_else_welchs():
     rates, others = pd.Series([70.0, 80.0, 84.0]), pd.Series([60.0, 79.0, 70.0])
     gaps = [10.0, 1.0, 14.0]
     half = 4.302653 * statistics.stdev(gaps) / 3**0.5
-    assert interval_of_difference(rates, others, True) == pytest.approx((25 / 3 - half, 25 / 3 + half), rel=1e-6)
+    assert difference(rates, others, True) == (pytest.approx(25 / 3), pytest.approx((25 / 3 - half, 25 / 3 + half)))
     shares = [statistics.variance(group) / 3 for group in (rates, others)]
     freedom = sum(shares) ** 2 / sum(share**2 / 2 for share in shares)  # Welch and Satterthwaite
     half = stats.t.ppf(0.975, freedom) * sum(shares) ** 0.5
-    assert interval_of_difference(rates, others, False) == pytest.approx((25 / 3 - half, 25 / 3 + half))
+    assert difference(rates, others, False) == (pytest.approx(25 / 3), pytest.approx((25 / 3 - half, 25 / 3 + half)))
 
 
 @pytest.mark.parametrize("paired", [True, False])
-def test_networks_that_do_not_differ_give_no_interval_of_a_difference(paired, recwarn):
-    same, others = pd.Series([100.0, 100.0]), pd.Series([60.0, 70.0])
-    assert interval_of_difference(same, same - 10, paired) is None
-    assert interval_of_difference(same, others, paired) == pytest.approx((-28.53, 98.53), abs=0.01)  # 35 +- 12.71 * 5
+def test_networks_that_do_not_differ_or_are_too_few_have_a_difference_without_interval(paired, recwarn):
+    same, others, nothing = pd.Series([100.0, 100.0]), pd.Series([60.0, 70.0]), float("nan")
+    assert difference(same, same - 10, paired) == (10, None)
+    # 35 +- 12.71 * 5, with one degree of freedom
+    assert difference(same, others, paired) == (35, pytest.approx((-28.53, 98.53), abs=0.01))
+    assert difference(same, pd.Series([60.0, nothing]), paired) == (40, None)
+    assert difference(same, pd.Series([nothing, nothing]), paired) == (pytest.approx(nothing, nan_ok=True), None)
     assert not recwarn
 
 
