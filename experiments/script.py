@@ -16,6 +16,7 @@ def run[Config](main: Callable[[Config], None], config_class: type[Config], argu
         words = sys.argv[1:] if arguments is None else arguments
         main(parse_flags(config_class, words, f"python experiments/{name}"))
     except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
         sys.exit(130)
     except (ValueError, OSError, RuntimeError, ParsingError) as error:
         sys.exit(f"{name}: {error}")
