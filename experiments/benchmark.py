@@ -27,7 +27,7 @@ from timing import describe_machine, one_core, take_turns, text, write
 from torch import Tensor
 
 from env_door.checks import check_range
-from lerobot_ufrnn.commands.flags import parse_flags
+from lerobot_ufrnn.commands import parse_flags
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig, ForesightConfig, RecallConfig, UFRNNConfig
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN

@@ -35,7 +35,7 @@ from env_door.latch import KINDS, check_kinds
 from env_door.limits import MAX_HOLD, MAX_OFFSET
 from env_door.trials import first_of_each_kind, read_trials
 from lerobot_ufrnn.analysis.results import count_by_door
-from lerobot_ufrnn.commands.flags import parse_flags
+from lerobot_ufrnn.commands import parse_flags
 
 # Nothing here imports LeRobot or PyTorch: their memory would lie idle while the commands need it.
 PROVENANCE_PATH = Path("meta/door_recording.json")  # where the recorder keeps its settings; it imports LeRobot

@@ -30,17 +30,12 @@ class VideoConfig(DoorTrialConfig):
 
 
 def run(config: VideoConfig) -> None:
-    """Runs trials until there is one to show, and writes its film.
-
-    Raises:
-        ValueError: If the policy is of another type, or finds out none of the doors.
-    """
+    """Runs trials until there is one to show, and writes its film."""
     policy = load_policy(config.policy_path)
     for kind in KINDS if config.kind == "any" else (config.kind,):
         history = run_door_trial(policy, config, kind, film=True, render_size=config.size)
-        tries = ", ".join(direction for _, direction in history.attempts) or "nothing"
-        result = "opened" if history.success else "not opened"
-        print(f"{kind} door: tried {tries}; went back {len(history.returns)} times; {result}", flush=True)
+        tried, result = history.outcome
+        print(f"{kind} door: tried {tried}; went back {len(history.returns)} times; {result}", flush=True)
         if config.kind != "any" or (history.recovered and history.returns):
             break
     else:
