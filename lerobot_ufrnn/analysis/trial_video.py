@@ -50,12 +50,11 @@ def annotate(history: TrialHistory) -> list[Image.Image]:
     return pictures
 
 
-def write_gif(pictures: Sequence[Image.Image], path: Path, every: int = 1) -> None:
-    """Writes an animation of every so-many-th picture and the last, that rests at its end, then begins again."""
-    kept = [*pictures[:-1:every], pictures[-1]]
-    sample = np.concatenate([np.asarray(picture) for picture in kept[:: -(-len(kept) // 12)]])
+def write_gif(pictures: Sequence[Image.Image], path: Path) -> None:
+    """Writes an animation that rests at its end, then begins again."""
+    sample = np.concatenate([np.asarray(picture) for picture in pictures[:: -(-len(pictures) // 12)]])
     palette = Image.fromarray(sample).quantize(NUM_COLORS)  # one for all, so that what stands still takes no space
-    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in kept]
-    milliseconds = [1000 // FRAMES_PER_SECOND] * (len(kept) - 1) + [round(1000 * SECONDS_AT_END)]
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    milliseconds = [1000 // FRAMES_PER_SECOND] * (len(pictures) - 1) + [round(1000 * SECONDS_AT_END)]
     path.parent.mkdir(parents=True, exist_ok=True)
     indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=milliseconds, loop=0)

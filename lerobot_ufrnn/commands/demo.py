@@ -77,8 +77,7 @@ def run(config: DemoConfig) -> None:
 def record(config: DemoConfig) -> None:
     """Records the demonstrations that are still missing."""
     start(
-        "ufrnn",
-        "record",
+        "ufrnn record",
         f"--repo_id={REPO_ID}",
         f"--root={config.dataset_dir}",
         f"--episodes_per_kind={config.episodes_per_kind}",
@@ -138,8 +137,7 @@ def evaluate(config: DemoConfig) -> None:
             f"--seed={TRIAL_SEED}",
         )
     start(
-        "ufrnn",
-        "results",
+        "ufrnn results",
         f"--trial_log={trial_log}",
         f"--trials_per_kind={config.trials_per_kind}",
         f"--output_dir={config.output_dir}",
@@ -151,8 +149,7 @@ def draw(config: DemoConfig) -> None:
     if config.exploration == "foresight":
         try:
             start(
-                "ufrnn",
-                "foresight",
+                "ufrnn foresight",
                 f"--policy_path={config.last_checkpoint}",
                 f"--output={config.output_dir / 'foresight.png'}",
                 f"--door_offset={config.door_offset}",
@@ -177,10 +174,11 @@ def keep_success_videos(config: DemoConfig) -> None:
     print(f"{len(list(videos.iterdir()))} videos of opened doors")
 
 
-def start(name: str, *flags: str) -> None:
+def start(command: str, *flags: str) -> None:
     """Runs a console command of LeRobot or of ours with this interpreter, to its end; an interruption is passed on."""
-    print("$ " + shlex.join([name, *flags]), flush=True)
-    status = subprocess.run([*with_this_python(name), *flags], check=False).returncode
+    name, *words = [*command.split(), *flags]
+    print("$ " + shlex.join([name, *words]), flush=True)
+    status = subprocess.run([*with_this_python(name), *words], check=False).returncode
     if status in (-2, 130):
         raise KeyboardInterrupt
     if status != 0:

@@ -20,13 +20,10 @@ class VideoConfig(DoorTrialConfig):
     """GIF file to write."""
     size: int = 360
     """Width of the picture in pixels, 16 to 768."""
-    speed: int = 1
-    """How many times as fast as it was: so many of its pictures are left out."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, "size", low=16, high=768)
-        check_range(self, "speed", low=1)
 
 
 def run(config: VideoConfig) -> None:
@@ -43,5 +40,5 @@ def run(config: VideoConfig) -> None:
             "In no trial was the first try wrong, the policy surprised and the door opened at last: give another "
             "--seed, or a --kind to film whatever happens."
         )
-    write_gif(annotate(history), config.output, config.speed)
+    write_gif(annotate(history), config.output)
     print(f"Film: {config.output} ({config.output.stat().st_size / 1e6:.1f} MB)")
