@@ -16,8 +16,12 @@ from .trial import TrialHistory
 
 OTHER_COLOR = "#999999"
 HELD: dict[str, Any] = {"color": "#ffcc33", "linewidth": 6.0, "alpha": 0.6}
-MARKERS = {"start of the trial": (".", 8), "first try": ("o", 9), "further try": ("s", 5), "opened": ("*", 13)}
-"""Shape and size."""
+MARKERS: dict[str, dict[str, Any]] = {
+    "start of the trial": {"marker": ".", "markersize": 8, "markerfacecolor": "black"},
+    "first try": {"marker": "o", "markersize": 9},
+    "further try": {"marker": "s", "markersize": 5},
+    "opened": {"marker": "*", "markersize": 13},
+}
 DOT_SPACING = 4.5
 """From dot to dot of a dotted line, in line widths."""
 
@@ -83,17 +87,15 @@ def _draw_model(panel: Axes, label: str, model: HiddenPaths) -> None:
     for number, (kind, of_kind) in enumerate(kinds):
         paths = of_kind.pivot(index="step", columns="path", values=["pc1", "pc2"])
         panel.plot(paths["pc1"], paths["pc2"], color=_color(kind), linewidth=0.5, alpha=0.2)
-        paths = paths.dropna()  # the mean ends with the shortest
+        mean = [paths.dropna()[axis].mean(axis=1) for axis in ("pc1", "pc2")]  # as long as the shortest
         # Dots of one kind fall between those of the others where their paths agree.
         dots = (DOT_SPACING * number / len(kinds), (1, DOT_SPACING - 1))
-        panel.plot(
-            paths["pc1"].mean(axis=1), paths["pc2"].mean(axis=1), color=_color(kind), linestyle=dots, linewidth=2
-        )
+        panel.plot(*mean, color=_color(kind), linestyle=dots, linewidth=2)
     panel.plot(*trial[history.held].T, solid_capstyle="round", **HELD)
     panel.plot(*trial.T, color="black", linewidth=0.8)
     panel.plot(*trial[0], **_marker("start of the trial"))
     for number, (step, direction) in enumerate(history.attempts):
-        panel.plot(*trial[step], **_marker("further try" if number else "first try", _color(direction)))
+        panel.plot(*trial[step], **_marker("further try" if number else "first try", markerfacecolor=_color(direction)))
     if history.success:
         panel.plot(*trial[-1], **_marker("opened"))
     first_try = "first try {1} at step {0}".format(*history.attempts[0]) if history.attempts else "no try"
@@ -107,13 +109,5 @@ def _color(kind: str) -> str:
     return DOOR_COLORS.get(kind, OTHER_COLOR)
 
 
-def _marker(name: str, face: str = "white") -> dict[str, Any]:
-    shape, size = MARKERS[name]
-    face = "black" if shape == "." else face
-    return {
-        "marker": shape,
-        "markersize": size,
-        "linestyle": "none",
-        "markeredgecolor": "black",
-        "markerfacecolor": face,
-    }
+def _marker(name: str, **style: Any) -> dict[str, Any]:
+    return {"linestyle": "none", "markeredgecolor": "black", "markerfacecolor": "white"} | MARKERS[name] | style

@@ -1,8 +1,8 @@
 """`ufrnn report`: the tables, pictures and videos of a folder in one page that needs nothing else."""
 
-import html
 from base64 import b64encode
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from string import Template
 
@@ -89,16 +89,16 @@ def run(config: ReportConfig) -> None:
     parts = [_part(config.folder, name, *texts) for name, texts in PARTS.items()]
     if videos := sorted(config.folder.glob("videos/*.mp4")):
         parts.append("<h2>Videos of opened doors</h2>")
-        parts += [f'<video controls src="{_data(video)}" title="{_text(video.name)}"></video>' for video in videos]
+        parts += [f'<video controls src="{_data(video)}" title="{escape(video.name)}"></video>' for video in videos]
     output = config.folder / "report.html"
-    output.write_text(PAGE.substitute(folder=_text(config.folder), parts="\n".join(parts)))
+    output.write_text(PAGE.substitute(folder=escape(str(config.folder)), parts="\n".join(parts)))
     print(f"Report: {output} ({output.stat().st_size / 1e6:.1f} MB)")
 
 
 def _part(folder: Path, name: str, heading: str, text: str, command: str) -> str:
-    path, text = folder / name, _text(text)
+    path, text = folder / name, escape(text)
     if not path.exists():
-        content = f"There is no {_text(path)}; <code>{_text(command.format(folder=folder))}</code> makes it."
+        content = f"There is no {escape(str(path))}; <code>{escape(command.format(folder=folder))}</code> makes it."
         return f"<h2>{heading}</h2>\n<p>{content}</p>"
     content = f"<div>{_tables(path)}</div>" if path.suffix == ".csv" else f'<img alt="{text}" src="{_data(path)}">'
     return f"<h2>{heading}</h2>\n<p>{text}</p>\n{content}"
@@ -118,7 +118,3 @@ def _data(path: Path) -> str:
     if not content.startswith(first_bytes):
         raise ValueError(f"{path} is no {media_type}: make it anew or remove it.")
     return f"data:{media_type};base64,{b64encode(content).decode()}"
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value))
