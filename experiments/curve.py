@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from script import run
 from tables import RESULTS, SUCCESS_COUNTS, read_table
 
-from lerobot_ufrnn.analysis.colors import DOOR_COLORS
+from lerobot_ufrnn.analysis.picture import DOOR_COLORS
 
 
 @dataclass

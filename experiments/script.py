@@ -6,7 +6,7 @@ from pathlib import Path
 
 from draccus.utils import ParsingError
 
-from lerobot_ufrnn.commands.flags import parse_flags
+from lerobot_ufrnn.commands import parse_flags
 
 
 def run[Config](main: Callable[[Config], None], config_class: type[Config], arguments: list[str] | None = None) -> None:

@@ -17,7 +17,7 @@ from tables import RESULTS, read_table
 from env_door import provenance
 from env_door.latch import KINDS
 from env_door.trials import Trial
-from lerobot_ufrnn.commands.flags import parse_flags
+from lerobot_ufrnn.commands import parse_flags
 
 MODEL = """
 policy: {type: ufrnn, autoencoder: {steps: 4}}
