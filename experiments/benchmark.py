@@ -7,12 +7,20 @@ What is compared takes turns in one process on one core, so that a busy machine 
 ratios of the pairs of each round.
 """
 
+import gc
 import itertools
 import json
+import os
+import platform
+import re
 import sys
 import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +30,13 @@ import torch
 from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
-from timing import describe_machine, one_core, take_turns, text, write
+from script import run
 from torch import Tensor
 
 from env_door.checks import check_range
-from lerobot_ufrnn.commands.flags import parse_flags
+from lerobot_ufrnn.analysis.results import markdown
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig, ForesightConfig, RecallConfig, UFRNNConfig
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
@@ -44,16 +53,100 @@ FEATURES: dict[str, Any] = {
     "device": "cpu",
 }
 # Stated, so that another default does not change what is measured. The scan knows these readings of the paper only.
-READINGS: dict[str, Any] = {"num_samples": 5, "horizon": 10, "horizon_mode": "fixed", "noise_unit": "std"}
-READINGS |= {"noise_scale": "linear", "perturbed_states": "hidden"}
-READINGS |= {"variance_baseline": "common", "variance_aggregation": "variance"}
-SIZES: dict[str, Any] = {"joint_hidden_dim": 50, "image_hidden_dim": 50, "shared_hidden_dim": 20}
 PAPER = UFRNNConfig(
-    foresight=ForesightConfig(**READINGS), autoencoder=AutoencoderConfig(feature_dim=10), **SIZES, **FEATURES
+    joint_hidden_dim=50,
+    image_hidden_dim=50,
+    shared_hidden_dim=20,
+    foresight=ForesightConfig(
+        num_samples=5,
+        horizon=10,
+        horizon_mode="fixed",
+        noise_unit="std",
+        noise_scale="linear",
+        perturbed_states="hidden",
+        variance_baseline="common",
+        variance_aggregation="variance",
+    ),
+    autoencoder=AutoencoderConfig(feature_dim=10),
+    **FEATURES,
 )
 BATCH_SIZE, LENGTH = 5, 149  # an episode of 150 frames has 149 next ones to predict
 FAST, REFERENCE, SCAN = "fast kernel", "readable code", "XLA scan"
 CYCLE = 100  # ticks of UF-RNN in a round
+PACKAGES = ("torch", "numba", "jax", "diffusers", "lerobot", "mujoco", "numpy")  # whose versions matter
+
+
+# ── Timing ────────────────────────────────────────────────────────────
+
+
+def take_turns(
+    calls: Mapping[Any, Callable[[], object]], seconds: float, min_rounds: int = 3, warm_up: int = 1
+) -> pd.DataFrame:
+    """Calls each in turn, round after round, without garbage collection; milliseconds, a row a round."""
+    for call in calls.values():
+        for _ in range(warm_up):
+            call()
+    rows: list[dict[str, float]] = []
+    gc.collect()
+    gc.disable()
+    try:
+        end = time.perf_counter() + seconds
+        while len(rows) < min_rounds or time.perf_counter() < end:
+            rows.append({})
+            for name, call in calls.items():
+                start = time.perf_counter()
+                call()
+                rows[-1][name] = 1e3 * (time.perf_counter() - start)
+    finally:
+        gc.enable()
+    return pd.DataFrame(rows)
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """One core for this thread and those that it starts; the last one, since the first usually serves interrupts."""
+    torch.set_num_threads(1)
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def text(values: pd.Series) -> str:
+    """Median and middle 80 %."""
+    low, median, high = np.percentile(values, (10, 50, 90))
+    return f"{median:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def describe_machine() -> dict[str, str]:
+    """Processor, cores and versions; nothing that names the machine or its user."""
+    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    model = re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE)
+    machine = {
+        "processor": model[1] if model else platform.processor() or "unknown",
+        "AVX-512": ("yes" if " avx512f" in info else "no") if info else "unknown",
+        "cores": str(os.cpu_count()),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+    }
+    return machine | {name: version(name) if find_spec(name) else "not installed" for name in PACKAGES}
+
+
+def write(name: str, note: str | None, table: pd.DataFrame, output_dir: Path) -> None:
+    """Prints a table, and writes `<name>.md` to read and `<name>.json` to compute with."""
+    machine = describe_machine()
+    page = f"# Benchmark: {name}\n\n{', '.join(f'{key} {value}' for key, value in machine.items())}\n\n"
+    page += f"{' '.join((note or '').split())} Medians with [10th, 90th percentile].\n\n{markdown(table)}"
+    output_dir.mkdir(parents=True, exist_ok=True)
+    (output_dir / f"{name}.md").write_text(page)
+    content = {"machine": machine, "table": table.to_dict("records")}
+    (output_dir / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n")
+    print(page, flush=True)
 
 
 # ── The training update ───────────────────────────────────────────────
@@ -108,17 +201,15 @@ def make_scan_update(config: UFRNNConfig = PAPER, batch_size: int = BATCH_SIZE, 
     model = make_model(UFRNN, config)
     episodes = [scan.jnp.array(part.transpose(0, 1).numpy()) for part in make_episodes(config, batch_size, length)]
     state = scan.start_adam({name: value.detach().numpy() for name, value in model.network.named_parameters()})
-    schedule = model.foresight.schedule
+    schedule, scan_update = model.foresight.schedule, scan.make_update(config)
     noise_bounds = scan.jnp.array(np.stack((schedule.low.numpy(), schedule.high.numpy())))
-    sizes = scan.ScanSizes.of(config)
     shape = (length, config.foresight.num_samples, batch_size, sum(model.network.state_sizes[::2]))
     generator = torch.Generator().manual_seed(0)
 
     def update() -> float:
         nonlocal state
         noise = torch.randn(shape, generator=generator).numpy()
-        rate, clip_norm = config.optimizer_lr, config.optimizer_grad_clip_norm
-        state, loss = scan.update(state, *episodes, noise, noise_bounds, sizes, rate, clip_norm)
+        state, loss = scan_update(state, *episodes, noise, noise_bounds)
         return float(loss)
 
     return update
@@ -162,20 +253,10 @@ def make_ufrnn(kernel: str, recall: bool = False) -> UFRNNPolicy:
     return policy.eval()
 
 
-def make_act() -> PreTrainedPolicy:
-    """LeRobot's ACT with default settings and random weights."""
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    return ACTPolicy(ACTConfig(pretrained_backbone_weights=None, **FEATURES)).eval()
-
-
-def make_diffusion() -> PreTrainedPolicy:
-    """LeRobot's Diffusion Policy with default settings and random weights; an ImportError without `diffusers`."""
-    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
-    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-
-    return DiffusionPolicy(DiffusionConfig(pretrained_backbone_weights=None, **FEATURES)).eval()
+def make_other(name: str) -> PreTrainedPolicy:
+    """LeRobot's `act` or `diffusion` with default settings and random weights; an ImportError without `diffusers`."""
+    config = make_policy_config(name, pretrained_backbone_weights=None, **FEATURES)
+    return get_policy_class(name)(config).eval()
 
 
 def time_ticks(policies: dict[str, PreTrainedPolicy], seconds: float, min_rounds: int, warm_up: int = 1):
@@ -213,13 +294,13 @@ def of_acting(seconds: float) -> pd.DataFrame:
     the longest of each chunk, for UF-RNN the longest of 100; amortised is the mean over it. With recall the worst tick
     is one that goes back and imagines.
     """
-    policies: dict[str, PreTrainedPolicy] = {"ACT": make_act()}
+    policies: dict[str, PreTrainedPolicy] = {"ACT": make_other("act")}
     policies["UF-RNN, foresight at each step, fast kernel"] = make_ufrnn("fast")
     policies["UF-RNN, foresight at each step, readable code"] = make_ufrnn("reference")
     policies["UF-RNN, recall, going back whenever it can"] = make_ufrnn("fast", recall=True)
     times = time_ticks(policies, seconds, min_rounds=10)
     try:
-        times |= time_ticks({"Diffusion Policy": make_diffusion()}, 0, min_rounds=1, warm_up=0)  # about a minute
+        times |= time_ticks({"Diffusion Policy": make_other("diffusion")}, 0, min_rounds=1, warm_up=0)  # about a minute
     except ImportError as error:
         print(f"No comparison with Diffusion Policy: {error}", file=sys.stderr)
     return pd.DataFrame(
@@ -243,18 +324,15 @@ def of_growth(seconds: float) -> pd.DataFrame:
 
     The exponent is the slope of log time over log size for the three largest.
     """
-
-    def imagining(**fields: Any) -> dict[str, Any]:
-        return {"config": replace(PAPER, foresight=replace(PAPER.foresight, **fields))}
-
+    foresight = PAPER.foresight
     sizes: dict[str, dict[int, dict[str, Any]]] = {
-        "N": {num_samples: imagining(num_samples=num_samples) for num_samples in (1, 2, 5, 10, 20)},
-        "T": {horizon: imagining(horizon=horizon) for horizon in (1, 5, 10, 20, 40)},
+        "N": {n: {"config": replace(PAPER, foresight=replace(foresight, num_samples=n))} for n in (1, 2, 5, 10, 20)},
+        "T": {t: {"config": replace(PAPER, foresight=replace(foresight, horizon=t))} for t in (1, 5, 10, 20, 40)},
         "batch": {size: {"batch_size": size} for size in (1, 2, 5, 10, 20)},
         "L": {length: {"length": length} for length in (50, 100, 149, 300, 600)},
         "hidden size": {
-            joint: {"config": replace(PAPER, joint_hidden_dim=joint, image_hidden_dim=joint, shared_hidden_dim=shared)}
-            for joint, shared in ((25, 10), (50, 20), (100, 40), (200, 80))
+            lower: {"config": replace(PAPER, joint_hidden_dim=lower, image_hidden_dim=lower, shared_hidden_dim=shared)}
+            for lower, shared in ((25, 10), (50, 20), (100, 40), (200, 80))
         },
     }
     rows = []
@@ -270,21 +348,17 @@ def of_growth(seconds: float) -> pd.DataFrame:
 
 # ── The command ───────────────────────────────────────────────────────
 
-PARTS = {"update": of_update, "acting": of_acting, "growth": of_growth}
+PARTS: dict[str, Callable[[float], pd.DataFrame]] = {"update": of_update, "acting": of_acting, "growth": of_growth}
 
 
 @dataclass
 class BenchmarkConfig:
     """What to measure."""
 
-    quick: bool = False
-    """Only the update and `select_action`, under a minute; the last line is a JSON object and nothing is written."""
-    parts: tuple[str, ...] = tuple(PARTS)
-    """Tables to make."""
-    seconds: float = 60.0
-    """Time for each part, after compiling; Diffusion Policy takes a minute more."""
-    output_dir: Path = Path("outputs/benchmark")
-    """Folder for a `.md` and a `.json` file of each part."""
+    quick: bool = False  # only update and `select_action`, under a minute; ends in a JSON object, writes nothing
+    parts: tuple[str, ...] = tuple(PARTS)  # tables to make
+    seconds: float = 60.0  # time for each part, after compiling; Diffusion Policy takes a minute more
+    output_dir: Path = Path("outputs/benchmark")  # folder for a `.md` and a `.json` file of each part
 
     def __post_init__(self) -> None:
         if not self.parts or not set(self.parts) <= set(PARTS):
@@ -309,11 +383,8 @@ def quick_figures(seconds: float = 4.0, rounds: int = 10, **problem) -> dict[str
     return {name: None if value is None else round(float(value), 4) for name, value in figures.items()}
 
 
-def main(arguments: list[str]) -> None:
+def main(config: BenchmarkConfig) -> None:
     """Measures, prints and writes."""
-    config = parse_flags(
-        BenchmarkConfig, ["--quick=true" if word == "--quick" else word for word in arguments], "benchmark.py"
-    )
     if config.quick:
         print(", ".join(f"{name} {value}" for name, value in describe_machine().items()), flush=True)
         print(json.dumps(quick_figures()), flush=True)
@@ -323,7 +394,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"benchmark.py: {error}")
+    run(main, BenchmarkConfig, ["--quick=true" if word == "--quick" else word for word in sys.argv[1:]])

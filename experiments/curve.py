@@ -14,39 +14,33 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from script import run
 from tables import RESULTS, SUCCESS_COUNTS, read_table
 
-from lerobot_ufrnn.analysis.colors import DOOR_COLORS
-
-PANELS_PER_ROW = 3
+from lerobot_ufrnn.analysis.picture import DOOR_COLORS
 
 
 @dataclass
 class CurveConfig:
     """What to draw."""
 
-    results: Path = RESULTS / "door_protocol.csv"
-    """Table that `sweep.py` wrote."""
-    output: Path = RESULTS / "success_curve.png"
-    """Picture to write."""
+    results: Path = RESULTS / "door_protocol.csv"  # table that `sweep.py` wrote
+    output: Path = RESULTS / "success_curve.png"  # picture to write
 
 
 def draw(table: pd.DataFrame, path: Path) -> None:
-    """Draws a panel a model. Where there are models with several epochs, those with a single one are left out.
+    """Draws a panel for each model with several epochs.
 
     The stacked areas are the doors of each kind that were opened within 30 s, as a share of all trials of all networks,
     so that their upper edge is the success rate. Each thin line is the success rate of one network.
     """
     epochs = table.groupby("model").epoch.nunique()
-    models = list(epochs[epochs > 1].index) or list(epochs.index)
-    num_columns = min(len(models), PANELS_PER_ROW)
-    num_rows = -(-len(models) // num_columns)
+    models = list(epochs[epochs > 1].index)
+    if not models:
+        raise ValueError("No model of the table was tried at several epochs: run sweep.py with --epochs.")
     with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(1 + 2.9 * num_columns, 0.6 + 2.6 * num_rows), layout="constrained")
-        panels = figure.subplots(num_rows, num_columns, sharey=True, squeeze=False).flatten()
-        for panel, model in zip(panels, models, strict=False):
+        figure = Figure(figsize=(1 + 2.9 * len(models), 3.2), layout="constrained")
+        panels = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
+        for panel, model in zip(panels, models, strict=True):
             _draw_model(panel, table[table.model == model])
             panel.set_title(model, fontsize=10, parse_math=False)
-        for panel in panels[len(models) :]:
-            panel.set_visible(False)
         figure.supylabel("doors opened within 30 s", fontsize=9)
         figure.supxlabel("epoch of training", fontsize=9)
         handles, labels = panels[0].get_legend_handles_labels()
@@ -60,32 +54,18 @@ def _draw_model(panel: Axes, table: pd.DataFrame) -> None:
     counts = table.pivot_table(index="epoch", columns="kind", values=["opened_300", "trials"], aggfunc="sum")
     kinds = [kind for kind in DOOR_COLORS if kind in set(table.kind)]
     shares = counts.opened_300[kinds].div(counts.trials.sum(axis=1), axis=0)  # (epochs, kinds)
-    single = len(shares) == 1
-    if single:  # one epoch has no width to fill: it becomes a bar
-        epoch = shares.index[0]
-        shares = pd.concat([shares.set_axis([epoch - 0.4]), shares.set_axis([epoch + 0.4])])
     colors = [DOOR_COLORS[kind] for kind in kinds]
     panel.stackplot(shares.index, shares.T, labels=kinds, colors=colors, linewidth=0)
-    networks = table.groupby(["train_seed", "epoch"])[["opened_300", "trials"]].sum()
-    for number, (_, network) in enumerate(networks.groupby("train_seed")):
-        panel.plot(
-            network.index.get_level_values("epoch"),
-            network.opened_300 / network.trials,
-            color="black",
-            linewidth=0.6,
-            clip_on=False,
-            marker="o",
-            markersize=3 if single else 1,
-            label="each training seed" if number == 0 else None,
-        )
-    panel.set(ylim=(0, 1), xlim=(shares.index[0] - 0.2, shares.index[-1] + 0.2) if single else (0, shares.index[-1]))
+    networks = table.groupby(["epoch", "train_seed"])[["opened_300", "trials"]].sum()
+    rates = (networks.opened_300 / networks.trials).unstack()  # (epochs, networks)
+    for number, seed in enumerate(rates):
+        label = "each training seed" if number == 0 else None
+        panel.plot(rates[seed].dropna(), "o-k", linewidth=0.6, markersize=1, clip_on=False, label=label)
+    panel.set(ylim=(0, 1), xlim=(0, shares.index[-1]))
     panel.grid(axis="y", color="0.9", linewidth=0.6)
     panel.set_axisbelow(True)
     panel.yaxis.set_major_formatter(PercentFormatter(1))
-    if single:
-        panel.set_xticks(table.epoch.unique())
-    else:
-        panel.xaxis.set_major_locator(MaxNLocator(3, integer=True, steps=[1, 2, 5, 10]))
+    panel.xaxis.set_major_locator(MaxNLocator(3, integer=True, steps=[1, 2, 5, 10]))
 
 
 def main(config: CurveConfig) -> None:

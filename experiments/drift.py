@@ -27,16 +27,11 @@ from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
 class DriftConfig:
     """Which policies to compare."""
 
-    policy_paths: list[str]
-    """Checkpoint folders or Hub repositories of `ufrnn` policies."""
-    dataset_dir: Path
-    """Folder of the demonstrations."""
-    labels: list[str] = field(default_factory=list)
-    """Names of the policies; those of the paper by default."""
-    horizon: int = 30
-    """Number T of imagined steps."""
-    seed: int = 2000
-    """Seed of the exploration while it reads the demonstrations."""
+    policy_paths: list[str]  # checkpoint folders or Hub repositories of `ufrnn` policies
+    dataset_dir: Path  # folder of the demonstrations
+    labels: list[str] = field(default_factory=list)  # names of the policies; those of the paper by default
+    horizon: int = 30  # number T of imagined steps
+    seed: int = 2000  # seed of the exploration while it reads the demonstrations
 
     def __post_init__(self) -> None:
         check_range(self, "horizon", low=1)

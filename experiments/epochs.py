@@ -7,9 +7,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-AUTOENCODER_STEPS = 400
-"""Default of `policy.autoencoder.steps`, stated here because the configuration imports PyTorch."""
-
+AUTOENCODER_STEPS = 400  # default of `policy.autoencoder.steps`, stated here because the configuration imports PyTorch
 MAX_CHECKPOINTS = 200
 
 
@@ -47,57 +45,40 @@ def read_model(path: Path) -> Model:
     return Model(path.stem, text, settings)
 
 
-class Schedule(NamedTuple):
-    """Updates of a training.
+def find_checkpoints(
+    settings: dict[str, Any], num_episodes: int, num_frames: int, epochs: Collection[int]
+) -> tuple[dict[int, int], int]:
+    """The update that ends each of some epochs, in order, and the updates between checkpoints so that each has one.
 
     An epoch is a pass of LeRobot's data loader, whose items are episodes for `ufrnn` and frames for other policies; for
-    `ufrnn` the updates of the autoencoder come first and belong to no epoch.
+    `ufrnn` the updates of the autoencoder come first and belong to no epoch. Without `epochs` the last one; a
+    ValueError if `steps` does not end with an epoch, or epochs would need too many checkpoints.
     """
-
-    autoencoder_steps: int
-    epoch_steps: int
-    steps: int
-
-    @classmethod
-    def of(cls, settings: dict[str, Any], num_episodes: int, num_frames: int) -> "Schedule":
-        """The schedule of a configuration file; a ValueError if `steps` does not end with an epoch."""
-        policy, steps = settings["policy"], settings["steps"]
-        items, autoencoder_steps = num_frames, 0
-        if policy["type"] == "ufrnn":
-            items, autoencoder = num_episodes, policy.get("autoencoder") or {}
-            autoencoder_steps = 0 if autoencoder.get("path") else autoencoder.get("steps", AUTOENCODER_STEPS)
-        epoch_steps = math.ceil(items / settings["batch_size"])
-        epochs = (steps - autoencoder_steps) / epoch_steps
-        if epochs < 1 or epochs % 1:
-            fitting = autoencoder_steps + max(1, round(epochs)) * epoch_steps
-            raise ValueError(
-                f"`steps` must be {autoencoder_steps} updates of the autoencoder and a multiple of the {epoch_steps} "
-                f"of an epoch, such as {fitting}; got {steps}."
-            )
-        return cls(autoencoder_steps, epoch_steps, steps)
-
-    @property
-    def last_epoch(self) -> int:
-        """Number of epochs."""
-        return (self.steps - self.autoencoder_steps) // self.epoch_steps
-
-    def step_of(self, epoch: int) -> int:
-        """The update that ends an epoch, counted from 1."""
-        if not 1 <= epoch <= self.last_epoch:
-            raise ValueError(
-                f"--epochs must be from 1 to {self.last_epoch}, where `steps` = {self.steps} ends, got {epoch}."
-            )
-        return self.autoencoder_steps + epoch * self.epoch_steps
-
-    def save_freq(self, epochs: Collection[int], longest: int) -> int:
-        """Updates between checkpoints, a divisor of `longest`, so that each of some epochs has its checkpoint."""
-        steps = [self.step_of(epoch) for epoch in epochs if epoch != self.last_epoch]  # the last one has one anyway
-        every, least = math.gcd(longest, *steps), math.ceil(self.steps / MAX_CHECKPOINTS)
-        if every < least:
-            raise ValueError(
-                f"--epochs={sorted(epochs)} end with updates {sorted(steps)} ({self.autoencoder_steps} of the "
-                f"autoencoder, then {self.epoch_steps} an epoch). With `save_freq` = {longest} that needs a checkpoint "
-                f"every {every} updates, over {MAX_CHECKPOINTS} in all. Choose epochs, `autoencoder.steps` and "
-                f"`save_freq` so that all these updates and `save_freq` have a common divisor of at least {least}."
-            )
-        return every
+    policy, steps = settings["policy"], settings["steps"]
+    items, first = num_frames, 0
+    if policy["type"] == "ufrnn":
+        items, autoencoder = num_episodes, policy.get("autoencoder") or {}
+        first = 0 if autoencoder.get("path") else autoencoder.get("steps", AUTOENCODER_STEPS)
+    epoch_steps = math.ceil(items / settings["batch_size"])
+    last_epoch = (steps - first) / epoch_steps
+    if last_epoch < 1 or last_epoch % 1:
+        raise ValueError(
+            f"`steps` must be {first} updates of the autoencoder and a multiple of the {epoch_steps} of an epoch, such "
+            f"as {first + max(1, round(last_epoch)) * epoch_steps}; got {steps}."
+        )
+    if epochs and not 1 <= min(epochs) <= max(epochs) <= last_epoch:
+        raise ValueError(
+            f"--epochs must be from 1 to {last_epoch:.0f}, where `steps` = {steps} ends, got {sorted(epochs)}."
+        )
+    step_of = {epoch: first + epoch * epoch_steps for epoch in sorted(epochs) or [int(last_epoch)]}
+    longest = max(0, settings.get("save_freq") or 0) or steps
+    wanted = [step for step in step_of.values() if step < steps]  # the last update has a checkpoint anyway
+    every, least = math.gcd(longest, *wanted), math.ceil(steps / MAX_CHECKPOINTS)
+    if every < least:
+        raise ValueError(
+            f"--epochs={sorted(epochs)} end with updates {wanted} ({first} of the autoencoder, then {epoch_steps} an "
+            f"epoch). With `save_freq` = {longest} that needs a checkpoint every {every} updates, over "
+            f"{MAX_CHECKPOINTS} in all. Choose epochs, `autoencoder.steps` and `save_freq` so that all these updates "
+            f"and `save_freq` have a common divisor of at least {least}."
+        )
+    return step_of, every

@@ -30,17 +30,18 @@ def locked(file: Path) -> Iterator[int]:
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("w") as stream:
         said = False
-        while True:
-            if stopping.is_set():
-                raise KeyboardInterrupt
-            with contextlib.suppress(BlockingIOError):
+        while not stopping.is_set():
+            try:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            if not said:
-                print(f"waiting for the process that works in {file.parent} (it has {file} locked)", flush=True)
+            except BlockingIOError:
+                if not said:
+                    print(f"waiting for the process that works in {file.parent} (it has {file} locked)", flush=True)
                 said = True
-            stopping.wait(1)
-        yield stream.fileno()
+                stopping.wait(1)
+            else:
+                yield stream.fileno()
+                return
+        raise KeyboardInterrupt
 
 
 def run_command(name: str, *words: str, flags: dict[str, Any], log: Path, lock: int) -> None:

@@ -5,54 +5,43 @@ simulators and plug-ins, with Python 3.12 and 3.13. Nothing is installed; each a
 partner alone is asked, too: a no may be theirs, and a yes may rest on an older version of the partner.
 """
 
-import argparse
-import re
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass, field
 from importlib.metadata import metadata, version
 from pathlib import Path
 
 import pandas as pd
+from script import run
 from tqdm import tqdm
+
+from lerobot_ufrnn.analysis.results import markdown
 
 ROOT = Path(__file__).parents[1]
 PYTHONS = ("3.12", "3.13")
+# Extras of the installed LeRobot that a user would ask for; those that end so only gather dependencies of others.
+EXTRAS = [name for name in metadata("lerobot").get_all("Provides-Extra") or [] if not name.endswith("-dep")]
 # Simulators that use MuJoCo and are common beside LeRobot, then third-party plug-ins of LeRobot.
-PARTNERS = (
-    "gym-hil",
-    "gym-aloha",
-    "gym-pusht",
-    "gymnasium-robotics",
-    "metaworld",
-    "robosuite",
-    "hf-libero",
-    "mani-skill",
-    "dm-control",
-    "mink",
-    "lerobot-env-so101",
-    "lerobot-policy-turbovla",
-    "lerobot-policy-act-smooth",
-    "lerobot-policy-act-ttt",
-    "lerobot-policy-rewact",
-    "lerobot-robot-xarm",
-    "lerobot-robot-piper",
-    "lerobot-robot-seeed-b601",
-    "lerobot-teleoperator-spacemouse",
-    "lerobot-teleoperator-teleop",
-)
-# Extras that only gather single dependencies of others.
-PARTS = re.compile(r"-dep$")
+OTHERS = """
+    gym-hil gym-aloha gym-pusht gymnasium-robotics metaworld robosuite hf-libero mani-skill dm-control mink
+    lerobot-env-so101 lerobot-policy-turbovla lerobot-policy-act-smooth lerobot-policy-act-ttt lerobot-policy-rewact
+    lerobot-robot-xarm lerobot-robot-piper lerobot-robot-seeed-b601 lerobot-teleoperator-spacemouse
+    lerobot-teleoperator-teleop
+"""
+PARTNERS = [*(f"lerobot[{name}]" for name in EXTRAS), *OTHERS.split()]
 
 
-def lerobot_extras() -> list[str]:
-    """Extras of the installed LeRobot that a user would ask for."""
-    names = metadata("lerobot").get_all("Provides-Extra") or []
-    return [f"lerobot[{name}]" for name in names if not PARTS.search(name)]
+@dataclass
+class ResolverConfig:
+    """What to resolve."""
+
+    partners: list[str] = field(default_factory=lambda: PARTNERS)  # requirements to resolve beside this package
+    output: Path = ROOT / "experiments" / "results" / "resolver.md"  # file for the table
 
 
 def resolve(uv: str, requirements: list[str], python: str) -> tuple[dict[str, str], str]:
-    """Versions that fit together, or none and what uv says of it."""
+    """Versions that fit together, or none and why: uv's hint, if it gives one."""
     done = subprocess.run(
         [uv, "pip", "compile", "--quiet", "--no-header", "--no-annotate", "--python-version", python, "-"],
         input="\n".join(requirements),
@@ -62,17 +51,7 @@ def resolve(uv: str, requirements: list[str], python: str) -> tuple[dict[str, st
     )
     if done.returncode == 0:
         return dict(line.split(" ;")[0].split("==") for line in done.stdout.splitlines() if "==" in line), ""
-    return {}, " ".join(done.stderr.split())
-
-
-def reason(message: str) -> str:
-    """What clashes: uv's hint if it gives one, else the last dependency of its chain of conclusions, best on MuJoCo."""
-    if "hint: " in message:
-        text = message.split("hint: ", 1)[1]
-    else:
-        facts = re.findall(r"[Bb]ecause (\S+ depends on \S+)", message) or [message]
-        text = ([fact for fact in facts if "mujoco" in fact] or facts)[-1]
-    return text if len(text) < 200 else text[:197] + "..."
+    return {}, " ".join(done.stderr.split()).split("hint: ")[-1].replace("|", "\\|")[:300]
 
 
 def row(uv: str, partner: str) -> dict[str, str]:
@@ -86,40 +65,29 @@ def row(uv: str, partner: str) -> dict[str, str]:
         if chosen and name == "lerobot":
             continue
         alone, alone_message = resolve(uv, [f"lerobot=={version('lerobot')}", partner], python)
-        if alone and alone.get(name) != chosen.get(name):
+        if not alone:
+            notes.append(f"{python}: nor beside LeRobot alone: {alone_message}")
+        elif alone.get(name) != chosen.get(name):
             with_mujoco = f"{alone.get(name)} with MuJoCo {alone.get('mujoco', 'none')}"
-            notes.append(f"{python}: beside LeRobot alone {with_mujoco}{message and '; ' + reason(message)}")
-        elif not alone:
-            notes.append(f"{python}: nor beside LeRobot alone: {reason(alone_message)}")
+            notes.append(f"{python}: beside LeRobot alone {with_mujoco}{message and '; ' + message}")
     return entry | {"note": "; ".join(notes)}
 
 
-def to_markdown(rows: list[dict[str, str]]) -> str:
-    """The rows as a table."""
-    frame = pd.DataFrame(rows).fillna("")
-    cells = [list(frame.columns), ["---"] * len(frame.columns), *frame.values.tolist()]
-    return "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |" for line in cells) + "\n"
-
-
-def main() -> None:
-    """Asks for all partners, or for those named, and writes the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("partners", nargs="*", help="requirements to resolve beside this package (default: all known)")
-    parser.add_argument("--output", type=Path, default=ROOT / "experiments" / "results" / "resolver.md")
-    arguments = parser.parse_args()
-    uv = shutil.which("uv") or str(ROOT / ".uv" / "bin" / "uv")
-    if not shutil.which(uv):
-        sys.exit("uv is needed: `pip install uv`, or run scripts/setup")
-    partners = arguments.partners or [*lerobot_extras(), *PARTNERS]
-    rows = [row(uv, partner) for partner in tqdm(partners, unit="partner")]
+def main(config: ResolverConfig) -> None:
+    """Asks for all partners and writes the table."""
+    uv = shutil.which("uv") or shutil.which(ROOT / ".uv" / "bin" / "uv")
+    if uv is None:
+        raise RuntimeError("uv is needed: `pip install uv`, or run scripts/setup")
+    rows = [row(uv, partner) for partner in tqdm(config.partners, unit="partner")]
     text = (
         f"Beside which packages this one can be installed (LeRobot {version('lerobot')}, asked on "
-        f"{pd.Timestamp.now():%Y-%m-%d} for {sys.platform}; `python experiments/resolver.py`).\n\n" + to_markdown(rows)
+        f"{pd.Timestamp.now():%Y-%m-%d} for {sys.platform}; `python experiments/resolver.py`).\n\n"
+        + markdown(pd.DataFrame(rows))
     )
     print(text)
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(text)
+    config.output.parent.mkdir(parents=True, exist_ok=True)
+    config.output.write_text(text)
 
 
 if __name__ == "__main__":
-    main()
+    run(main, ResolverConfig)

@@ -16,8 +16,6 @@ import os
 import shutil
 import signal
 import string
-import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,8 +24,9 @@ from typing import Any
 
 import pandas as pd
 from draccus.utils import ParsingError
-from epochs import Model, Schedule, read_model
+from epochs import Model, find_checkpoints, read_model
 from jobs import locked, replace_text, run_command, stop
+from script import run
 from tables import HELD_COUNTS, KEY, RESULTS, SUCCESS_COUNTS, describe, read_table
 
 from env_door.checks import check_range
@@ -35,7 +34,6 @@ from env_door.latch import KINDS, check_kinds
 from env_door.limits import MAX_HOLD, MAX_OFFSET
 from env_door.trials import first_of_each_kind, read_trials
 from lerobot_ufrnn.analysis.results import count_by_door
-from lerobot_ufrnn.commands.flags import parse_flags
 
 # Nothing here imports LeRobot or PyTorch: their memory would lie idle while the commands need it.
 PROVENANCE_PATH = Path("meta/door_recording.json")  # where the recorder keeps its settings; it imports LeRobot
@@ -50,40 +48,23 @@ FREE_SETTINGS = ("save_freq", "log_freq", "output_dir", "job_name", "seed")  # m
 class SweepConfig:
     """What to train, and how to try it."""
 
-    models: list[Path]
-    """Files for `lerobot-train --config_path`, of any type of policy; the name of a file is the name of the model."""
-    train_seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
-    """Seeds of training; each model is trained with each of them."""
-    epochs: list[int] = field(default_factory=list)
-    """Checkpoints to try, in passes over the demonstrations; the last one when empty."""
-    trials_per_kind: int = 100
-    """Trials for each kind of door at each checkpoint."""
-    trial_seed: int = 10000
-    """Seed of the first trial; the others count up from it, the same for every network."""
-    hold_seconds: float = 0.0
-    """Interference: for how long somebody holds the door still once it has begun to open."""
-    variant: str = ""
-    """Name of what `policy_flags` change, in the table `<model>+<variant>`."""
-    policy_flags: dict[str, Any] = field(default_factory=dict)
-    """Fields of the policy to change in the trials only, such as `{recall.enabled: false}`: nothing is trained anew."""
-    kinds: tuple[str, ...] = KINDS
-    """Kinds of door, in demonstrations and trials."""
-    episodes_per_kind: int = 5
-    """Demonstrations for each kind of door."""
-    matched: bool = True
-    """Whether the kinds share start poses and timing; unmatched, as a human's are, these may tell them apart."""
-    num_steps: int = 150
-    """Steps of a demonstration; the demonstrator needs up to 102, or 99 without sliding doors."""
-    door_offset: float = 0.0
-    """Half-width in metres of the range of the door's lateral shift, in demonstrations and trials."""
-    output_dir: Path = Path("outputs/sweep")
-    """Folder of checkpoints, trial logs and the output of every command."""
-    dataset_dir: Path | None = None
-    """Demonstrations, recorded if missing (into `output_dir` when not given); those of others are taken as they are."""
-    results: Path | None = None
-    """Table to add to; it does not say which trials were run, so that others than by default need one of their own."""
-    workers: int = os.cpu_count() or 1
-    """Networks that are trained and tried side by side, with one thread each."""
+    models: list[Path]  # files for `lerobot-train --config_path`; a model has the name of its file
+    train_seeds: list[int] = field(default_factory=lambda: [0, 1, 2])  # each model is trained with each seed
+    epochs: list[int] = field(default_factory=list)  # checkpoints to try, in passes over the data; else the last one
+    trials_per_kind: int = 100  # trials for each kind of door at each checkpoint
+    trial_seed: int = 10000  # seed of the first trial; the others count up from it, the same for every network
+    hold_seconds: float = 0.0  # interference: for how long somebody holds the door still once it has begun to open
+    variant: str = ""  # name of what `policy_flags` change, in the table `<model>+<variant>`
+    policy_flags: dict[str, Any] = field(default_factory=dict)  # changes in the trials: `{recall.enabled: false}`
+    kinds: tuple[str, ...] = KINDS  # kinds of door, in demonstrations and trials
+    episodes_per_kind: int = 5  # demonstrations for each kind of door
+    matched: bool = True  # whether the kinds share start poses and timing, which may tell them apart otherwise
+    num_steps: int = 150  # steps of a demonstration; the demonstrator needs up to 102, or 99 without sliding doors
+    door_offset: float = 0.0  # half-width in m of the range of the door's lateral shift, demonstrations and trials
+    output_dir: Path = Path("outputs/sweep")  # folder of checkpoints, trial logs and the output of every command
+    dataset_dir: Path | None = None  # demonstrations, recorded if missing; by default in `output_dir`
+    results: Path | None = None  # table to add to; it does not say which trials were run: others need another one
+    workers: int = os.cpu_count() or 1  # networks that are trained and tried side by side, with one thread each
 
     def __post_init__(self) -> None:
         for name in ("models", "train_seeds", "epochs"):
@@ -173,8 +154,9 @@ class Network:
 
     config: SweepConfig
     model: Model
-    schedule: Schedule
     seed: int
+    step_of: dict[int, int]  # epochs to try, and the updates that end them
+    save_freq: int  # updates between checkpoints
 
     @property
     def name(self) -> str:
@@ -187,17 +169,6 @@ class Network:
         return self.config.output_dir / self.model.name / f"seed{self.seed}"
 
     @property
-    def epochs(self) -> list[int]:
-        """Checkpoints to try."""
-        return sorted(self.config.epochs) or [self.schedule.last_epoch]
-
-    @property
-    def save_freq(self) -> int:
-        """Updates between checkpoints."""
-        wanted = self.model.settings.get("save_freq") or 0
-        return self.schedule.save_freq(self.epochs, wanted if wanted > 0 else self.schedule.steps)
-
-    @property
     def checkpoints(self) -> dict[int, Path]:
         """Update to the folder of its checkpoint, in rising order."""
         folders = (self.folder / "train" / "checkpoints").glob("[0-9]*")
@@ -205,14 +176,9 @@ class Network:
 
     @property
     def last_checkpoint(self) -> int:
-        """The last update whose checkpoint is whole, 0 if there is none.
-
-        LeRobot points the link `last` at a checkpoint once it is written; it takes the old link away just before.
-        """
-        link, steps = self.folder / "train" / "checkpoints" / "last", list(self.checkpoints)
-        if link.is_symlink():
-            return int(link.readlink().name)
-        return steps[-1] if len(steps) > 1 else 0
+        """The last update whose checkpoint is whole, to which LeRobot points the link `last`; 0 if there is none."""
+        link = self.folder / "train" / "checkpoints" / "last"
+        return int(link.readlink().name) if link.is_symlink() else 0
 
     def trial_log(self, epoch: int) -> Path:
         """Trials of an epoch's checkpoint."""
@@ -220,11 +186,21 @@ class Network:
 
     def run(self) -> list[str]:
         """Trains, then tries one checkpoint after the other; returns what failed."""
+        failures = []
         with locked(self.folder / "lock") as lock:
-            if not _attempt(f"{self.name}: training", lambda: self.train(lock)):
-                return [f"{self.name}: training"]
-            tries = {f"{self.name}: trials {self.config.trials} of epoch {epoch}": epoch for epoch in self.epochs}
-            return [name for name, epoch in tries.items() if not _attempt(name, partial(self.evaluate, epoch, lock))]
+            work = {f"{self.name}: training": partial(self.train, lock)}
+            for epoch in self.step_of:
+                work[f"{self.name}: trials {self.config.trials} of epoch {epoch}"] = partial(self.evaluate, epoch, lock)
+            for name, do in work.items():
+                try:
+                    do()
+                    print(f"[{name}] is done", flush=True)
+                except (RuntimeError, ValueError, OSError) as error:
+                    print(f"[{name}] failed: {error}", flush=True)
+                    failures.append(name)
+                    if name.endswith("training"):
+                        break
+        return failures
 
     def train(self, lock: int) -> None:
         """Trains, from the last checkpoint on if there is one, unless it is done."""
@@ -233,7 +209,7 @@ class Network:
         settings["dataset_size"] = count_demonstrations(self.config.demonstrations)
         claim(self.folder / "train.json", settings)
         folder, step = self.folder / "train", self.last_checkpoint
-        if step == self.schedule.steps:
+        if step == self.model.settings["steps"]:
             return
         if step > 0:
             flags = {"config_path": self.checkpoints[step] / "pretrained_model" / "train_config.json", "resume": "true"}
@@ -251,8 +227,7 @@ class Network:
         claim(log.parent.with_suffix(".json"), config.policy_flags)
         if self.missing_trials(epoch):
             shutil.rmtree(log.parent, ignore_errors=True)
-            step = self.schedule.step_of(epoch)
-            if step not in self.checkpoints:
+            if (step := self.step_of[epoch]) not in self.checkpoints:
                 raise FileNotFoundError(
                     f"{self.folder} has no checkpoint of epoch {epoch} (update {step}); it has those of updates "
                     f"{list(self.checkpoints)}. Choose among them, or delete that folder to train again."
@@ -292,15 +267,13 @@ class Network:
 
 def plan(config: SweepConfig, models: list[Model]) -> list[Network]:
     """All networks, every model with the first seed before any with the second; the demonstrations exist."""
-    size, networks = count_demonstrations(config.demonstrations), []
-    for seed in config.train_seeds:
-        for model in models:
-            try:
-                networks.append(Network(config, model, Schedule.of(model.settings, *size), seed))
-                _ = networks[-1].save_freq
-            except ValueError as error:
-                raise ValueError(f"Model {model.name}: {error}") from error
-    return networks
+    size, checkpoints = count_demonstrations(config.demonstrations), {}
+    for model in models:
+        try:
+            checkpoints[model.name] = find_checkpoints(model.settings, *size, config.epochs)
+        except ValueError as error:
+            raise ValueError(f"Model {model.name}: {error}") from error
+    return [Network(config, model, seed, *checkpoints[model.name]) for seed in config.train_seeds for model in models]
 
 
 # ── Files ─────────────────────────────────────────────────────────────
@@ -332,19 +305,8 @@ def claim(file: Path, request: dict[str, Any]) -> None:
 # ── The command ───────────────────────────────────────────────────────
 
 
-def _attempt(name: str, work: Callable[[], None]) -> bool:
-    try:
-        work()
-    except (RuntimeError, ValueError, OSError) as error:
-        print(f"[{name}] failed: {error}", flush=True)
-        return False
-    print(f"[{name}] is done", flush=True)
-    return True
-
-
-def main(arguments: list[str]) -> None:
+def main(config: SweepConfig) -> None:
     """Does what is not done yet, and prints the table; a RuntimeError if something failed, with the rest done."""
-    config = parse_flags(SweepConfig, arguments, "sweep.py")
     if config.table.exists():
         read_table(config.table, config.counts)  # refuses another kind of table before the work
     models = [read_model(path) for path in config.models]
@@ -365,9 +327,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"sweep.py: {error}")
-    except KeyboardInterrupt:
-        sys.exit("sweep.py: stopped; run it again to go on")
+    run(main, SweepConfig)

@@ -11,10 +11,12 @@ ever differs.
 """
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -37,15 +39,14 @@ HELD_RATES = {
     "of these, opened in 30 s": ("opened_after_hold", "held"),
     "of these, tried another way meanwhile": ("tried_another_way", "held"),
 }
-Rates = dict[str, tuple[str, str]]
+SAME = 1e-9  # difference in percentage points from which rates differ
 
 
 @dataclass
 class TablesConfig:
     """What to print."""
 
-    results: list[Path] = field(default_factory=lambda: sorted(RESULTS.glob("*.csv")))
-    """Tables that `sweep.py` wrote; all of `experiments/results` when not given."""
+    results: list[Path] = field(default_factory=lambda: sorted(RESULTS.glob("*.csv")))  # tables of `sweep.py`
 
 
 def read_table(path: Path, counts: Sequence[str] | None = None) -> pd.DataFrame:
@@ -73,7 +74,7 @@ def read_table(path: Path, counts: Sequence[str] | None = None) -> pd.DataFrame:
     return table
 
 
-def rates_of(table: pd.DataFrame) -> Rates:
+def rates_of(table: pd.DataFrame) -> dict[str, tuple[str, str]]:
     """Which counts of a table make a rate: heading to part and whole."""
     return HELD_RATES if "held" in table else SUCCESS_RATES
 
@@ -85,30 +86,32 @@ def rates_of_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> pd
     return pd.DataFrame({name: 100 * counts[part] / counts[whole] for name, (part, whole) in rates_of(table).items()})
 
 
-def interval(rates: Sequence[float]) -> tuple[float, float] | None:
-    """95 % t-interval of the mean of rates in percent, clipped to what it can be; None if they do not differ."""
-    if len(set(rates)) < 2:
+def interval(values: pd.Series, lowest: float = 0.0) -> tuple[float, float] | None:
+    """95 % t-interval of a mean in percent, clipped to what it can be; None where values do not differ."""
+    if len(values) < 2 or np.ptp(values) < SAME:
         return None
-    low, high = stats.t.interval(0.95, len(rates) - 1, loc=np.mean(rates), scale=stats.sem(rates))
-    return max(0.0, float(low)), min(100.0, float(high))
+    return _clip(stats.ttest_1samp(values, 0), lowest)
 
 
-def interval_of_difference(rates: pd.Series, others: pd.Series, paired: bool) -> tuple[float, float] | None:
-    """95 % interval of the difference of two means over networks in percentage points; None where there is no spread.
+def difference(rates: pd.Series, others: pd.Series, paired: bool) -> tuple[float, tuple[float, float] | None]:
+    """Difference of two means over networks in percentage points, and its 95 % interval; None where nothing differs.
 
     `paired` if networks of the same seed are the same networks that act in another way; otherwise it is Welch's.
     """
     if paired:
         gaps = (rates - others).dropna()
-        spread, freedom = gaps.std() / np.sqrt(len(gaps)), len(gaps) - 1
-    else:
-        shares = np.array([group.var() / len(group) for group in (rates, others)])
-        spread = np.sqrt(shares.sum())
-        freedom = shares.sum() ** 2 / sum(shares**2 / [len(rates) - 1, len(others) - 1]) if spread > 0 else 0
-    if not spread > 0:
-        return None
-    low, high = stats.t.interval(0.95, freedom, loc=rates.mean() - others.mean(), scale=spread)
-    return max(-100.0, float(low)), min(100.0, float(high))
+        return round(gaps.mean(), 9), interval(gaps, lowest=-100)  # no difference of rounding
+    rates, others = rates.dropna(), others.dropna()
+    gap = rates.mean() - others.mean()
+    if min(len(rates), len(others)) < 2 or max(np.ptp(rates), np.ptp(others)) < SAME:
+        return gap, None
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # networks of one model may not differ
+        return gap, _clip(stats.ttest_ind(rates, others, equal_var=False), lowest=-100)
+
+
+def _clip(test: Any, lowest: float) -> tuple[float, float]:
+    low, high = np.clip(test.confidence_interval(0.95), lowest, 100)
+    return float(low), float(high)
 
 
 def summarize_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> pd.DataFrame:
@@ -119,7 +122,7 @@ def summarize_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> p
     summary = groups[first].apply(lambda each: ", ".join(map(_number, each))).to_frame(f"{first}: each")
     for name in rates:
         summary[f"{name}: mean" if name == first else name] = groups[name].apply(
-            lambda each: _text(each.mean(), interval(list(each.dropna())))
+            lambda each: _text(each.mean(), interval(each.dropna()))
         )
     last = table[table.epoch == table.groupby("model").epoch.transform("max")]
     of_network = last.groupby([*by, "train_seed"]).trials.sum().groupby(list(by))
@@ -139,14 +142,7 @@ def differences(table: pd.DataFrame) -> pd.DataFrame:
     # From the last name back, which is `ufrnn` minus its baselines.
     for (model, rates), (other, of_other) in combinations(reversed(by_model.items()), 2):
         paired = model.split("+")[0] == other.split("+")[0]
-        cells = {
-            name: _text(
-                rates[name].mean() - of_other[name].mean(),
-                interval_of_difference(rates[name].dropna(), of_other[name].dropna(), paired),
-                "+",
-            )
-            for name in rates
-        }
+        cells = {name: _text(*difference(rates[name], of_other[name], paired), "+") for name in rates}
         rows.append({"difference": f"{model} - {other}", **cells})
     return pd.DataFrame(rows)
 

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,6 @@ from env_door.twin import ports
 from lerobot_ufrnn.commands import with_this_python
 
 END_SECONDS = 30.0  # how long a command may take to end after an interrupt
-POLL_SECONDS = 0.02
 
 
 def robot_flags(address: str) -> list[str]:
@@ -72,72 +70,41 @@ def write_events(events: Sequence[Event], file: Path) -> None:
     file.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
 
 
-class StockCommand:
-    """A command of LeRobot, run by this interpreter for as long as a `with` block, or ended before.
+class StockCommand(subprocess.Popen):
+    """A command of LeRobot, such as `lerobot-rollout`, run by this interpreter until the end of a `with` block.
 
-    Args:
-        name (`str`): Such as `lerobot-rollout`.
-        *flags (`str`): Its flags.
-        **environment (`str`): Variables that it sees besides ours.
+    `environment` are variables that it sees besides ours.
     """
 
     def __init__(self, name: str, *flags: str, **environment: str):
-        self._name, self._environment = name, environment
-        self._arguments = [*with_this_python(name), *flags]
-
-    def __enter__(self) -> "StockCommand":
-        self._output = tempfile.TemporaryFile()
-        self.process = subprocess.Popen(
-            self._arguments,
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115
+        super().__init__(
+            [*with_this_python(name), *flags],
             stdin=subprocess.DEVNULL,
-            stdout=self._output,
+            stdout=self._log,
             stderr=subprocess.STDOUT,
-            env={**os.environ, **self._environment},
+            env={**os.environ, **environment},
             start_new_session=True,  # Ctrl-C reaches our process alone, which then ends it in order
             preexec_fn=_heed_signals,
         )
-        return self
 
-    def __exit__(self, *exc_info: object) -> None:
+    def __exit__(self, *exc_info) -> None:
         self.stop()
-        self._output.close()
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether it runs no more."""
-        return self.process.poll() is not None
+        self._log.close()
 
     def output(self) -> str:
         """What it has printed so far."""
-        self._output.seek(0)
-        return self._output.read().decode(errors="replace")
+        self._log.seek(0)
+        return self._log.read().decode(errors="replace")
 
     def stop(self) -> None:
         """Interrupts it, as LeRobot wants to be ended early, and waits for its end; kills it if it takes too long."""
-        if not self.has_ended:
-            self.process.send_signal(signal.SIGINT)
+        self.send_signal(signal.SIGINT)  # nothing if it has ended
         try:
-            self.process.wait(END_SECONDS)
+            self.wait(END_SECONDS)
         except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
-    def wait_for(self, text: str, seconds: float) -> None:
-        """Waits until it has printed something.
-
-        Raises:
-            RuntimeError: If it ends without printing it, or takes longer; the message has the end of its output.
-        """
-        deadline = time.monotonic() + seconds
-        while text not in self.output():
-            if self.has_ended and text not in self.output():
-                what = f"ended with status {self.process.returncode} before it printed {text!r}"
-            elif time.monotonic() > deadline:
-                what = f"did not print {text!r} within {seconds:g} s"
-            else:
-                time.sleep(POLL_SECONDS)
-                continue
-            raise RuntimeError(f"{self._name} {what}:\n{self.output()[-2000:]}")
+            self.kill()
+            self.wait()
 
 
 def _heed_signals() -> None:
@@ -152,10 +119,7 @@ def late_ticks(output: str) -> int:
 
 
 def last_error(output: str) -> str:
-    """The last thing that a command told its user about its end, without what to do about it.
-
-    An error with its name, or what asked the command to end; empty if there is neither.
-    """
+    """The last thing that a command told its user about its end, an error or a signal, without what to do about it."""
     # Without FFmpeg LeRobot warns at the start with the whole traceback of a decoder that it then does without.
     output = re.sub(r"\[start of libtorchcodec.*?\[end of libtorchcodec", "", output, flags=re.S)
     errors = re.findall(

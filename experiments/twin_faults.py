@@ -61,12 +61,12 @@ def on_twin(name: str, **parameters: float) -> Action:
 
 def send(number: int) -> Action:
     """A signal to the command."""
-    return lambda twin, command: command.process.send_signal(number)
+    return lambda twin, command: command.send_signal(number)
 
 
 def servo(command: StockCommand) -> psutil.Process:
     """The servo process, the only one that the command spawns through `multiprocessing`."""
-    children = psutil.Process(command.process.pid).children(recursive=True)
+    children = psutil.Process(command.pid).children(recursive=True)
     found = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
     if len(found) != 1:
         raise RuntimeError(f"the recording has {len(found)} processes that could be the servo, not one")
@@ -127,7 +127,6 @@ class Outcome:
     """What became of one injection."""
 
     name: str
-    injection: Injection
     speed: float  # of the fastest joint at that moment, in rad/s
     standstill: float | None  # s until the arm stood; `None` if it never did
     moved_again: bool  # once it had stood
@@ -146,7 +145,7 @@ class Outcome:
 
     def problems(self) -> list[str]:
         """What must not be, in a few words each; empty if all is well."""
-        allowed, status = self.injection, self.status or 0
+        allowed, status = INJECTIONS[self.name], self.status or 0
         resumes = allowed.release is not None
         late = self.standstill is None or self.standstill > MAX_STOP_SECONDS
         crashed = self.ended is not None and status < 0 and -status != allowed.may_die_of
@@ -169,12 +168,12 @@ class Outcome:
             return "**FAILED**: " + ", ".join(problems)
         if self.status != 0:
             return "stopped; the recording cannot be read" if self.lost else "stopped"
-        return "stopped, then went on" if self.injection.must_stop else "went on, not noticed"
+        return "stopped, then went on" if INJECTIONS[self.name].must_stop else "went on, not noticed"
 
     def row(self) -> dict[str, str]:
         """Its row of the table."""
         # When the recording went on, the arm stood at its end, which says nothing of the injection.
-        stopped = self.standstill is not None and (self.injection.must_stop or self.status != 0)
+        stopped = self.standstill is not None and (INJECTIONS[self.name].must_stop or self.status != 0)
         frames = ", ".join(map(str, self.episodes))
         return {
             "injection": self.name,
@@ -197,12 +196,6 @@ def describe(status: int) -> str:
     return str(status)
 
 
-def report(outcomes: Sequence[Outcome], untried: Sequence[str]) -> str:
-    """The table, in Markdown."""
-    note = f"\nNot tried, for the arm did not get into motion: {', '.join(untried)}.\n" if untried else ""
-    return (markdown(pd.DataFrame([outcome.row() for outcome in outcomes])) if outcomes else "") + note
-
-
 # ── The experiment ────────────────────────────────────────────────────
 
 
@@ -221,51 +214,40 @@ class FaultsConfig:
 
 
 def main(config: FaultsConfig) -> None:
-    """Tries the injections one after the other, and prints the table.
-
-    Raises:
-        RuntimeError: If one led to what must not be, or could not be tried.
-    """
+    """Tries the injections one after the other, and prints the table; a RuntimeError if one led to what must not be."""
     outcomes: list[Outcome] = []
-    untried: list[str] = []
     for name in config.injections:
-        try:
-            outcomes.append(inject(name, config.seed))
-        except RuntimeError as error:
-            untried.append(name)
-            print(f"{name}: not tried: {error}", flush=True)
-        else:
-            print(f"{name}: {outcomes[-1].verdict}", flush=True)
+        outcomes.append(inject(name, config.seed))
+        print(f"{name}: {outcomes[-1].verdict}", flush=True)
+        table = markdown(pd.DataFrame([outcome.row() for outcome in outcomes]))
         if config.output is not None:
             config.output.parent.mkdir(parents=True, exist_ok=True)
-            config.output.write_text(report(outcomes, untried))
-    print("\n" + report(outcomes, untried), end="", flush=True)
-    problems = [f"{outcome.name} led to what must not be" for outcome in outcomes if outcome.problems()]
-    problems += [f"{name} could not be tried" for name in untried]
-    if problems:
-        raise RuntimeError("; ".join(problems))
+            config.output.write_text(table)
+    print(f"\n{table}", end="", flush=True)
+    if failed := [outcome.name for outcome in outcomes if outcome.problems()]:
+        raise RuntimeError(f"{', '.join(failed)} led to what must not be")
 
 
 def inject(name: str, seed: int, starts: int = STARTS) -> Outcome:
-    """One injection, with a twin and a folder of its own: nothing of it is left for the next.
-
-    Raises:
-        RuntimeError: If the arm could not be set in motion.
-    """
+    """One injection, with a twin and a folder of its own: nothing of it is left for the next."""
     with tempfile.TemporaryDirectory(prefix="twin-faults-") as folder:
         write_events(movement(), events := Path(folder) / "events.jsonl")
         dataset = Path(folder) / "dataset"
-        with (
-            TwinProcess(kind="push", seed=seed, camera=True) as twin,
-            StockCommand("lerobot-record", *session_flags(twin.address, events, dataset)) as command,
-        ):
-            try:
-                samples = set_in_motion(twin, command)
-            except RuntimeError:
-                if starts == 1:
-                    raise
-            else:
-                return watch(name, twin, command, samples, dataset)
+        flags = [
+            "--dataset.single_task=move",
+            "--dataset.reset_time_s=0",
+            # As root LeRobot's default encoder would give the whole program real-time priority, over the servo's head.
+            "--dataset.rgb_encoder.vcodec=h264",
+            "--display_data=false",
+        ]
+        with TwinProcess(kind="push", seed=seed, camera=True) as twin:
+            flags += record_flags(twin.address, events, "me/faults", dataset, EPISODE_SECONDS, episodes=2)
+            with StockCommand("lerobot-record", *flags) as command:
+                if samples := set_in_motion(twin, command):
+                    return watch(name, twin, command, samples, dataset)
+                text = command.output()
+    if starts == 1:
+        raise RuntimeError(f"{name} could not be tried, for the arm did not get into motion:\n{text[-2000:]}")
     return inject(name, seed, starts - 1)
 
 
@@ -279,36 +261,21 @@ def movement() -> list[Event]:
     return [Event(1.5, np.array([-0.8, 0, 0, 0, 0, 0])), *(Event(1 / 8, twist) for twist in circle)]
 
 
-def session_flags(address: str, events: Path, dataset: Path) -> list[str]:
-    """Flags of `lerobot-record`."""
-    return [
-        *record_flags(address, events, "me/faults", dataset, EPISODE_SECONDS, episodes=2),
-        "--dataset.single_task=move",
-        "--dataset.reset_time_s=0",
-        # As root LeRobot's default encoder would give the whole program real-time priority, over the servo's head.
-        "--dataset.rgb_encoder.vcodec=h264",
-        "--display_data=false",
-    ]
-
-
 def set_in_motion(twin: TwinProcess, command: StockCommand) -> list[Sample]:
-    """Waits until the arm moves in the second episode.
-
-    Raises:
-        RuntimeError: If it does not.
-    """
-    command.wait_for("Recording episode 1", START_SECONDS)
-    samples: list[Sample] = []
+    """Waits until the arm moves in the second episode: the samples of its motion, none if it does not."""
     begin = time.monotonic()
-    while time.monotonic() - begin < EPISODE_SECONDS / 2:
-        if command.has_ended:
-            raise RuntimeError(f"lerobot-record ended too soon:\n{command.output()[-2000:]}")
+    while "Recording episode 1" not in command.output():
+        if command.poll() is not None or time.monotonic() - begin > START_SECONDS:
+            return []
+        time.sleep(SAMPLE_SECONDS)
+    begin, samples = time.monotonic(), []
+    while time.monotonic() - begin < EPISODE_SECONDS / 2 and command.poll() is None:
         samples.append(look(twin))
         if samples[-1].speed < MOVING:
             samples.clear()
         elif samples[-1].time - samples[0].time >= MOVING_SECONDS:
             return samples
-    raise RuntimeError(f"the arm did not move at {MOVING} rad/s for {MOVING_SECONDS} s:\n{command.output()[-2000:]}")
+    return []
 
 
 def look(twin: TwinProcess) -> Sample:
@@ -322,7 +289,7 @@ def look(twin: TwinProcess) -> Sample:
 def watch(name: str, twin: TwinProcess, command: StockCommand, samples: list[Sample], dataset: Path) -> Outcome:
     """Makes it fail, looks on until a little after the end of the command, clears it, and looks once more."""
     injection = INJECTIONS[name]
-    children = psutil.Process(command.process.pid).children(recursive=True)
+    children = psutil.Process(command.pid).children(recursive=True)
     try:
         speed, begin = samples[-1].speed, time.monotonic()
         injection.start(twin, command)
@@ -332,11 +299,11 @@ def watch(name: str, twin: TwinProcess, command: StockCommand, samples: list[Sam
             if release is not None and now > RELEASE_SECONDS:
                 release(twin, command)
                 release = None
-            if ended is None and command.has_ended:
+            if ended is None and command.poll() is not None:
                 ended = now
             if ended is not None and now > ended + WATCH_SECONDS:
                 break
-        status = command.process.poll()
+        status = command.poll()
         command.stop()
         left_running = names_of_running(children)
     finally:
@@ -349,7 +316,6 @@ def watch(name: str, twin: TwinProcess, command: StockCommand, samples: list[Sam
         cleared.append(look(twin))
     return Outcome(
         name,
-        injection,
         speed,
         *stop_after(samples, begin),
         ended=ended,
@@ -392,8 +358,7 @@ def readable_episodes(root: Path) -> tuple[int, ...]:
             places = [(frame["episode_index"].item(), frame["frame_index"].item()) for frame in frames]
         except Exception:
             places = []
-        whole = places == [(number, frame) for frame in range(end - first)]
-        readable.append(len(places) if whole else 0)
+        readable.append(len(places) if places == [(number, frame) for frame in range(end - first)] else 0)
     return tuple(readable)
 
 

@@ -127,23 +127,32 @@ def record(
 
 
 def operate(config: RecordingConfig, twin: TwinProcess, root: Path, events: list[Event], kind: str, seed: int) -> str:
-    """Records one episode into a folder; returns how late what was.
-
-    Raises:
-        SpoiltTakeError: If it is not to be kept.
-    """
+    """Records one episode into a folder; returns how late what was, or raises `SpoiltTakeError`."""
     before = twin.reset(kind, seed)
     # LeRobot moves temporary files into place. From another file system that would write through the hard links of a
     # staged directory, into the data set itself; this folder lies beside it.
     with tempfile.TemporaryDirectory() as folder:
         write_events(events, file := Path(folder) / "events.jsonl")
-        flags = episode_flags(config, twin.address, root, file)
+        # As in the simulation: frames keep the full resolution of colours and no trace of later ones.
+        encoder = asdict(FrameEncoderConfig())
+        flags = [
+            *record_flags(twin.address, file, config.repo_id, root, config.episode_seconds, episodes=1),
+            "--teleop.id=script",
+            "--dataset.single_task=open the door",
+            "--dataset.no_stamp=true",
+            "--dataset.streaming_encoding=true",
+            "--dataset.encoder_threads=1",
+            # A full queue drops frames; this one holds the episode.
+            f"--dataset.encoder_queue_maxsize={round(config.episode_seconds * FPS) + 1}",
+            *(f"--dataset.rgb_encoder.{name}={json.dumps(value)}" for name, value in encoder.items()),
+            f"--resume={str(root.exists()).lower()}",
+        ]
         with StockCommand("lerobot-record", *flags, TMPDIR=folder) as command:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                command.process.wait(START_SECONDS + 2 * config.episode_seconds)
+                command.wait(START_SECONDS + 2 * config.episode_seconds)
             state = twin.state()
             command.stop()
-            text, status = command.output(), command.process.returncode
+            text, status = command.output(), command.returncode
     delays = f"{late_ticks(text)} late ticks, {state['lost_seconds'] - before['lost_seconds']:.1f} s lost by the twin"
     if status != 0:
         raise SpoiltTakeError(f"lerobot-record ended with {describe_failure(status, text)}")
@@ -154,30 +163,8 @@ def operate(config: RecordingConfig, twin: TwinProcess, root: Path, events: list
     return delays
 
 
-def episode_flags(config: RecordingConfig, address: str, root: Path, events: Path) -> list[str]:
-    """Flags with which `lerobot-record` adds an episode to a data set."""
-    # As in the simulation: frames keep the full resolution of colours and no trace of later ones.
-    encoder = asdict(FrameEncoderConfig())
-    return [
-        *record_flags(address, events, config.repo_id, root, config.episode_seconds, episodes=1),
-        "--teleop.id=script",
-        "--dataset.single_task=open the door",
-        "--dataset.no_stamp=true",
-        "--dataset.streaming_encoding=true",
-        "--dataset.encoder_threads=1",
-        # A full queue drops frames; this one holds the episode.
-        f"--dataset.encoder_queue_maxsize={round(config.episode_seconds * FPS) + 1}",
-        *(f"--dataset.rgb_encoder.{name}={json.dumps(value)}" for name, value in encoder.items()),
-        f"--resume={str(root.exists()).lower()}",
-    ]
-
-
 def count_steps(config: RecordingConfig, root: Path, num_episodes: int) -> int:
-    """Steps of the last of some episodes.
-
-    Raises:
-        SpoiltTakeError: If it is not there in full.
-    """
+    """Steps of the last of some episodes; a `SpoiltTakeError` if it is not there in full."""
     metadata = LeRobotDatasetMetadata(config.repo_id, root=root)
     if metadata.total_episodes != num_episodes:
         saved = metadata.total_episodes - num_episodes + 1

@@ -8,7 +8,6 @@ import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,42 +69,27 @@ def main(config: TrialsConfig) -> None:
 
 
 def try_door(twin: TwinProcess, policy_path: str, kind: str, seed: int, duration: float) -> tuple[Trial, str]:
-    """One trial, and a note on its roll-out. One that fails on the way is a trial, too.
-
-    Raises:
-        RuntimeError: If it ends before it moves the arm; the message has the end of its output.
-    """
+    """One trial, and a note on its roll-out; one that fails on the way is a trial, too, if it has moved the arm."""
     twin.reset(kind, seed)
-    with StockCommand("lerobot-rollout", *rollout_flags(twin.address, policy_path, duration)) as rollout:
+    flags = [f"--policy.path={policy_path}", f"--fps={FPS}", f"--duration={duration}", "--task=open the door"]
+    flags += [*robot_flags(twin.address), "--return_to_initial_position=false"]
+    with StockCommand("lerobot-rollout", *flags) as rollout:
         trial = watch(twin, rollout, kind, seed, duration)
-        failed = rollout.has_ended and rollout.process.returncode != 0
+        failed = bool(rollout.poll())
         rollout.stop()
-        text, status = rollout.output(), rollout.process.returncode
+        text, status = rollout.output(), rollout.returncode
     if trial is None:
         raise RuntimeError(f"lerobot-rollout ended with status {status} before it moved the arm:\n{text[-2000:]}")
     note = f"{late_ticks(text)} late ticks"
     return trial, f"{note}; lerobot-rollout ended with {describe_failure(status, text)}" if failed else note
 
 
-def rollout_flags(address: str, policy_path: str, duration: float) -> list[str]:
-    """Flags of `lerobot-rollout`."""
-    return [
-        *robot_flags(address),
-        f"--policy.path={policy_path}",
-        f"--fps={FPS}",
-        f"--duration={duration}",
-        "--task=open the door",
-        "--return_to_initial_position=false",
-    ]
-
-
 def watch(twin: TwinProcess, rollout: StockCommand, kind: str, seed: int, duration: float) -> Trial | None:
     """Looks on until the door is open or the time is over; `None` if the roll-out ends before it moved the arm."""
     begin = held_at = None
     deadline = time.monotonic() + START_SECONDS + duration
-    state: dict[str, Any] = {}
     while time.monotonic() < deadline:
-        state = twin.state()
+        state, has_ended = twin.state(), rollout.poll() is not None
         if begin is None and any(abs(state["targets"][name] - at) > MOVED for name, at in state["joints"].items()):
             begin = state["time"]
             twin.arrivals()  # those of connecting do not count
@@ -113,10 +97,8 @@ def watch(twin: TwinProcess, rollout: StockCommand, kind: str, seed: int, durati
             steps = round((state["time"] - begin) * FPS)
             if state["held"] and held_at is None:
                 held_at = steps
-            if state["is_open"] or steps >= duration * FPS or rollout.has_ended:
-                break
-        elif rollout.has_ended:
-            return None
+        if has_ended or (begin is not None and (state["is_open"] or steps >= duration * FPS)):
+            break
         time.sleep(POLL_SECONDS)
     if begin is None:
         return None

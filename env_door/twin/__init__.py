@@ -4,7 +4,7 @@
 protocols: `ur_rtde`'s interfaces, sockets of the gripper's URCap and LeRobot's `zmq` camera connect to it.
 
 Reading order: `server` and `ports` (the clock, and who is served) -> `rtde`, `script`, `gripper`, `camera` (protocols)
--> `controller`, `motion`, `live_door` (what they act on) -> `injections` (what can be made to fail).
+-> `controller`, `arm` (what they act on) -> `injections` (what can be made to fail).
 """
 
 from env_door.twin.client import TwinClient, TwinError, TwinProcess, free_address

@@ -11,43 +11,31 @@ import draccus
 from draccus.utils import ParsingError
 
 from env_door.twin.client import READY
-from env_door.twin.configuration import TwinConfig
-from env_door.twin.server import Twin
+from env_door.twin.server import Twin, TwinConfig
 
 logger = logging.getLogger("env_door.twin")
 
 
-async def run() -> None:
+async def main() -> None:
     """Runs a twin until it is told to stop."""
     try:
         config = draccus.parse(TwinConfig)
         twin = Twin(config)
         await twin.open()
-    except ParsingError as error:
+    except (ParsingError, ValueError, OSError, ModuleNotFoundError, RuntimeError) as error:
         sys.exit(f"env_door.twin: {error.__cause__ or error}")  # draccus wraps what the configuration says
-    except (ValueError, OSError, ModuleNotFoundError, RuntimeError) as error:
-        sys.exit(f"env_door.twin: {error}")
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, twin.stopped.set)
     if config.until_stdin_closes:
         loop.add_reader(sys.stdin, twin.stopped.set)
-    logger.info("listening on %s; %s", config.address, twin.controller.describe())
+    logger.info("listening on %s", config.address)
     print(READY, flush=True)
     with contextlib.closing(twin):
         await twin.run()
 
 
-def loop_with_exact_timers() -> asyncio.AbstractEventLoop:
-    """A loop whose selector, unlike the default one, does not wait in whole milliseconds: ticks come in time."""
-    return asyncio.SelectorEventLoop(selectors.SelectSelector())
-
-
-def main() -> None:
-    """Runs the command."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    asyncio.run(run(), loop_factory=loop_with_exact_timers)
-
-
 if __name__ == "__main__":
-    main()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # Unlike the default one, this selector does not wait in whole milliseconds: ticks come in time.
+    asyncio.run(main(), loop_factory=lambda: asyncio.SelectorEventLoop(selectors.SelectSelector()))

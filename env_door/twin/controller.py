@@ -6,15 +6,15 @@ and waits for somebody to unlock it; an emergency stop and a loss of power end i
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable, Iterator
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from env_door.twin.arm import TIME_STEP, JointMotion, LiveDoor
 from env_door.twin.gripper import GripperModel
-from env_door.twin.live_door import LiveDoor
-from env_door.twin.motion import TIME_STEP, JointMotion
 from env_door.twin.ports import lines
 
 logger = logging.getLogger(__name__)
@@ -35,29 +35,10 @@ REGISTERS = [
 ]
 
 
-class RobotMode(IntEnum):
-    """What the arm is ready for."""
-
-    BOOTING = 2
-    POWER_OFF = 3
-    IDLE = 5
-    RUNNING = 7
-
-
-class SafetyMode(IntEnum):
-    """Why the arm may not move."""
-
-    NORMAL = 1
-    PROTECTIVE_STOP = 3
-    ROBOT_EMERGENCY_STOP = 7
-
-
-class ProgramState(IntEnum):
-    """RTDE's `runtime_state`."""
-
-    STOPPED = 1
-    PLAYING = 2
-    PAUSED = 4
+# What the arm is ready for, why it may not move, and RTDE's `runtime_state`.
+RobotMode = IntEnum("RobotMode", {"BOOTING": 2, "POWER_OFF": 3, "IDLE": 5, "RUNNING": 7})
+SafetyMode = IntEnum("SafetyMode", {"NORMAL": 1, "PROTECTIVE_STOP": 3, "ROBOT_EMERGENCY_STOP": 7})
+ProgramState = IntEnum("ProgramState", {"STOPPED": 1, "PLAYING": 2, "PAUSED": 4})
 
 
 class ScriptError(Exception):
@@ -67,11 +48,8 @@ class ScriptError(Exception):
 class Controller:
     """State of the controller, the arm's motion, the gripper and the scene.
 
-    Attributes:
-        registers (`dict[str, float]`):
-            The letter box between a client and the program, by RTDE's names. As on a real controller registers keep
-            their values when a client leaves.
-        written (`dict[str, float]`): Time in s at which an input register was last written.
+    `registers` are the letter box between a client and the program, by RTDE's names. As on a real controller they keep
+    their values when a client leaves.
     """
 
     def __init__(self, door: LiveDoor, unlock_seconds: float):
@@ -79,7 +57,6 @@ class Controller:
         self.gripper = GripperModel()
         self.motion = JointMotion(door.joint_low, door.joint_high, np.array(door.arm.joint_speed))
         self.registers: dict[str, float] = dict.fromkeys(REGISTERS, 0)
-        self.written: dict[str, float] = {}
         self.tool_offset: NDArray[np.float64] = np.array(TOOL_POINT)
         self.time = 0.0
         self.robot_mode = RobotMode.RUNNING
@@ -87,13 +64,13 @@ class Controller:
         self.program_state = ProgramState.STOPPED
         self.remote_control = True
         self.watchdog: tuple[str, float] | None = None  # an input, and the longest time between two writes of it
+        self._written: dict[str, float] = {}  # when
         self._unlock_seconds = unlock_seconds
         self._stopped_at = 0.0
         self._program: Iterator[None] | None = None
-        self._starting: tuple[float, Iterator[None]] | None = None
-        self._switching: tuple[float, Callable[[], None]] | None = None
+        self._program_starts = 0.0
+        self._switching_ends = math.inf
         self._ticks = 0
-        self.gripper.switch_on(0.0)
         self.settle()
 
     @property
@@ -109,9 +86,7 @@ class Controller:
         """Goes on by 2 ms; raises a RuntimeError if the physics diverged."""
         self._ticks += 1
         self.time = self._ticks * TIME_STEP
-        if self._switching is not None and self.time >= self._switching[0]:
-            finish, self._switching = self._switching[1], None
-            finish()
+        self._switch()
         self._watch()
         self._run_program()
         self.motion.step()
@@ -126,20 +101,20 @@ class Controller:
         """Takes what a client writes; what is no register has no effect."""
         if name in self.registers:
             self.registers[name] = value
-            self.written[name] = self.time
+            self._written[name] = self.time
 
-    def start_program(self, program: Iterator[None], name: str) -> None:
+    def start_program(self, program: Iterator[None]) -> None:
         """Starts a program, which is advanced every 2 ms, in the place of another, if the arm may be controlled."""
-        if self.remote_control and self.may_move:
-            self.stop_program()
-            self._starting = (self.time + START_SECONDS, program)
-            logger.info("program %s taken", name)
-        else:
-            logger.info("program %s refused: %s", name, self.describe())
+        if not (self.remote_control and self.may_move):
+            control = "remote" if self.remote_control else "local"
+            logger.info("program refused: %s, %s, %s control", self.robot_mode.name, self.safety_mode.name, control)
+            return
+        self.stop_program()
+        self._program, self._program_starts = program, self.time + START_SECONDS
 
     def stop_program(self) -> None:
         """Ends the running program; a moving arm brakes. Watchdogs end with it, as on a real controller."""
-        self._program = self.watchdog = self._starting = None
+        self._program = self.watchdog = None
         self.program_state = ProgramState.STOPPED
         self.motion.stop(STOP_DECELERATION)
 
@@ -149,7 +124,7 @@ class Controller:
             return False
         self.program_state = ProgramState.PLAYING
         if self.watchdog is not None:  # it must not take the pause for a client that has fallen silent
-            self.written[self.watchdog[0]] = self.time
+            self._written[self.watchdog[0]] = self.time
         return True
 
     def pause(self) -> bool:
@@ -163,14 +138,15 @@ class Controller:
     def arm_watchdog(self, name: str, min_frequency: float) -> None:
         """Ends the program once an input is written less often than so many times a second; 0 watches no more."""
         self.watchdog = (name, 1.0 / min_frequency) if min_frequency > 0 else None
-        self.written[name] = self.time
+        self._written[name] = self.time
 
     def protective_stop(self, reason: str) -> None:
         """Stops at once, pauses the program and waits to be unlocked."""
         if self.may_move:
             logger.warning("protective stop: %s", reason)
+            if self.program_state == ProgramState.STOPPED:
+                self._program = None  # it was about to start
             self.pause()
-            self._starting = None
             self.safety_mode, self._stopped_at = SafetyMode.PROTECTIVE_STOP, self.time
             self.settle()
 
@@ -182,64 +158,57 @@ class Controller:
             self.safety_mode = SafetyMode.NORMAL
         return True
 
-    def press_emergency_stop(self) -> None:
-        """Emergency stop: the program ends, brakes close and the arm loses its power."""
-        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
-        self.power_off()
-
-    def release_emergency_stop(self) -> None:
-        """Pulls the button out again; the arm stays without power until somebody switches it on."""
-        if self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
-            self.safety_mode = SafetyMode.NORMAL
+    def emergency_stop(self, pressed: bool) -> None:
+        """Presses the button, which takes the arm's power away, or pulls it out again; the arm stays without power."""
+        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP if pressed else SafetyMode.NORMAL
+        if pressed:
+            self.power_off()
 
     def power_off(self) -> None:
         """Takes the arm's power away: the program ends and brakes close."""
         self.stop_program()
         self.settle()
-        self._switching = None
+        self._switching_ends = math.inf
         self.robot_mode = RobotMode.POWER_OFF
         self.gripper.switch_off()
 
     def power_on(self) -> None:
         """Switches the arm on, with brakes closed; without effect during an emergency stop."""
-
-        def finish() -> None:
-            self.robot_mode = RobotMode.IDLE
-            self.gripper.switch_on(self.door.closure)
-
         if self.robot_mode == RobotMode.POWER_OFF and self.safety_mode == SafetyMode.NORMAL:
             self.robot_mode = RobotMode.BOOTING
-            self._switching = (self.time + POWER_SECONDS, finish)
+            self._switching_ends = self.time + POWER_SECONDS
 
     def release_brakes(self) -> None:
         """Releases the brakes of an arm that is switched on."""
+        if self.robot_mode == RobotMode.IDLE and self.safety_mode == SafetyMode.NORMAL:
+            self._switching_ends = self.time + POWER_SECONDS
 
-        def finish() -> None:
+    def _switch(self) -> None:
+        if self.time < self._switching_ends:
+            return
+        self._switching_ends = math.inf
+        if self.robot_mode == RobotMode.BOOTING:
+            self.robot_mode = RobotMode.IDLE
+            self.gripper.switch_on(self.door.closure)
+        else:
             self.robot_mode = RobotMode.RUNNING
             self.settle()
-
-        if self.robot_mode == RobotMode.IDLE and self.safety_mode == SafetyMode.NORMAL:
-            self._switching = (self.time + POWER_SECONDS, finish)
-
-    def describe(self) -> str:
-        """What the controller is in, for logs."""
-        modes = f"robot {self.robot_mode.name}, safety {self.safety_mode.name}, program {self.program_state.name}"
-        return f"{modes}, {'remote' if self.remote_control else 'local'} control"
 
     def _watch(self) -> None:
         if self.watchdog is not None and self.program_state == ProgramState.PLAYING:
             name, longest = self.watchdog
-            silence = self.time - self.written[name]
+            silence = self.time - self._written[name]
             if silence > longest:
                 logger.warning("watchdog: %s not written for %.3f s; the program ends", name, silence)
                 self.stop_program()
 
     def _run_program(self) -> None:
-        if self._starting is not None and self.time >= self._starting[0]:
-            self._program, self._starting = self._starting[1], None
-            self.program_state = ProgramState.PLAYING
-        if self._program is None or self.program_state != ProgramState.PLAYING:
+        if self._program is None or self.program_state == ProgramState.PAUSED:
             return
+        if self.program_state == ProgramState.STOPPED:
+            if self.time < self._program_starts:
+                return
+            self.program_state = ProgramState.PLAYING
         try:
             next(self._program)
         except (StopIteration, ScriptError) as end:
@@ -248,51 +217,43 @@ class Controller:
             self.stop_program()
 
 
-class Dashboard:
+async def serve_dashboard(controller: Controller, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """The dashboard server on port 29999: what a person does on the teach pendant, as lines of text.
 
     Replies are those of an e-Series controller, which clients compare letter by letter.
     """
-
-    def __init__(self, controller: Controller):
-        self._controller = controller
-        # What is done, and the answers to what was done and to what could not be. A controller in local control leaves
-        # all of it to the person in front of it. Clients take any answer to `stop` but this one for a failure.
-        self._actions: dict[str, tuple[Callable[[], bool | None], str, str]] = {
-            "play": (controller.play, "Starting program", "Failed to execute: play"),
-            "pause": (controller.pause, "Pausing program", "Failed to execute: pause"),
-            "stop": (controller.stop_program, "Stopped", ""),
-            "unlock protective stop": (controller.unlock, "Protective stop releasing", STILL_LOCKED),
-            "power on": (controller.power_on, "Powering on", ""),
-            "power off": (controller.power_off, "Powering off", ""),
-            "brake release": (controller.release_brakes, "Brake releasing", ""),
-        }
-        self._questions: dict[str, Callable[[], str]] = {
-            "running": lambda: f"Program running: {str(controller.program_state == ProgramState.PLAYING).lower()}",
-            "programstate": lambda: f"{controller.program_state.name} <unnamed>",
-            "robotmode": lambda: f"Robotmode: {controller.robot_mode.name}",
-            "safetymode": lambda: f"Safetymode: {controller.safety_mode.name}",
-            "safetystatus": lambda: f"Safetystatus: {controller.safety_mode.name}",
-            "is in remote control": lambda: str(controller.remote_control).lower(),
-            "close safety popup": lambda: "closing safety popup",
-            "get serial number": lambda: "20235500001",  # without which ur_rtde's control does not connect
-            "polyscopeversion": lambda: f"URSoftware {'.'.join(map(str, VERSION))} (Oct 15 2023)",
-        }
-
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Carries out the commands of one client."""
-        writer.write(b"Connected: Universal Robots Dashboard Server\n")
-        async for line in lines(reader):
-            if line.lower() == "quit":
-                writer.write(b"Disconnected\n")
-                return
-            writer.write(f"{self._answer(line)}\n".encode())
-
-    def _answer(self, line: str) -> str:
+    # What is done, and the answers to what was done and to what could not be. A controller in local control leaves all
+    # of it to the person in front of it. Clients take any answer to `stop` but this one for a failure.
+    actions: dict[str, tuple[Callable[[], bool | None], str, str]] = {
+        "play": (controller.play, "Starting program", "Failed to execute: play"),
+        "pause": (controller.pause, "Pausing program", "Failed to execute: pause"),
+        "stop": (controller.stop_program, "Stopped", ""),
+        "unlock protective stop": (controller.unlock, "Protective stop releasing", STILL_LOCKED),
+        "power on": (controller.power_on, "Powering on", ""),
+        "power off": (controller.power_off, "Powering off", ""),
+        "brake release": (controller.release_brakes, "Brake releasing", ""),
+    }
+    writer.write(b"Connected: Universal Robots Dashboard Server\n")
+    async for line in lines(reader):
         command = line.lower()
-        if command in self._actions:
-            if not self._controller.remote_control:
-                return f"Failed to execute: {command}"
-            action, done, failed = self._actions[command]
-            return failed if action() is False else done
-        return self._questions.get(command, lambda: f"could not understand: '{line}'")()
+        if command == "quit":
+            writer.write(b"Disconnected\n")
+            return
+        answers = {
+            "running": f"Program running: {str(controller.program_state == ProgramState.PLAYING).lower()}",
+            "programstate": f"{controller.program_state.name} <unnamed>",
+            "robotmode": f"Robotmode: {controller.robot_mode.name}",
+            "safetymode": f"Safetymode: {controller.safety_mode.name}",
+            "safetystatus": f"Safetystatus: {controller.safety_mode.name}",
+            "is in remote control": str(controller.remote_control).lower(),
+            "close safety popup": "closing safety popup",
+            "get serial number": "20235500001",  # without which ur_rtde's control does not connect
+            "polyscopeversion": f"URSoftware {'.'.join(map(str, VERSION))} (Oct 15 2023)",
+        }
+        answer = answers.get(command, f"could not understand: '{line}'")
+        if command in actions:
+            action, done, failed = actions[command]
+            answer = f"Failed to execute: {command}"
+            if controller.remote_control:
+                answer = failed if action() is False else done
+        writer.write(f"{answer}\n".encode())

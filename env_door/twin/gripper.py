@@ -5,6 +5,7 @@ squeezing with the force that was set. It reads 3 when it is open and 230 when i
 """
 
 import asyncio
+import contextlib
 
 from env_door.twin.ports import lines
 
@@ -24,19 +25,13 @@ MOVING, BLOCKED_OPENING, BLOCKED_CLOSING, AT_TARGET = 0, 1, 2, 3
 
 
 class GripperModel:
-    """The gripper's variables and the closure it drives its fingers to.
-
-    Attributes:
-        target (`float`): Closure to drive the fingers to, 0 open to 1 closed.
-        silent (`bool`): Whether the socket answers nothing.
-        garbage (`bool`): Whether the socket answers nonsense.
-        cause (`int`): Fault that comes back with every activation; 0 for none.
-    """
+    """The gripper's variables, and the closure to drive the fingers to: `target`, 0 open to 1 closed."""
 
     def __init__(self) -> None:
-        self.silent = self.garbage = False
-        self.cause = 0
+        self.silent = self.garbage = False  # whether the socket answers nothing, or nonsense
+        self._cause = 0  # a fault that comes back with every activation; 0 for none
         self.switch_off()
+        self.switch_on(0.0)
 
     def switch_off(self) -> None:
         """Takes its power away: afterwards it must be activated."""
@@ -63,7 +58,7 @@ class GripperModel:
 
     def fail(self, code: int) -> None:
         """Breaks it with a fault of 1 to 15; 0 takes the cause away, though a major fault lasts until activation."""
-        self.cause = code
+        self._cause = code
         if code or self._fault < MAJOR_FAULT:
             self._fault = code
 
@@ -74,7 +69,7 @@ class GripperModel:
             self._activating -= seconds
             self._approach(0.0, seconds)
             if self._activating <= 0:
-                self._status, self._fault = ACTIVE, self.cause
+                self._status, self._fault = ACTIVE, self._cause
         elif self._status == ACTIVE and self._set["GTO"] and self._fault < MAJOR_FAULT:
             self._approach(self._goal, seconds)
         self._still = self._still + seconds if moved < 0.02 * seconds else 0.0
@@ -103,20 +98,14 @@ class GripperModel:
         """Value of a variable; `"?"` for an unknown one and while the gripper has no power."""
         if not self.powered:
             return "?"
-        status = {
-            "STA": self._status,
-            "OBJ": self._object,
-            "FLT": self._fault,
-            "POS": round(OPEN + min(max(self._measured, 0.0), 1.0) * (CLOSED - OPEN)),
-            "PRE": self._set["POS"],
-        }
-        return str((self._set | status).get(name, "?"))
+        position = round(OPEN + min(max(self._measured, 0.0), 1.0) * (CLOSED - OPEN))
+        status = {"STA": self._status, "OBJ": self._object, "FLT": self._fault, "POS": position}
+        return str((self._set | status | {"PRE": self._set["POS"]}).get(name, "?"))
 
     def set(self, values: dict[str, int]) -> bool:
         """Sets variables; whether they were taken: all or none."""
-        if not self.powered or not values:
-            return False
-        if any(name not in self._set or not 0 <= value <= 255 for name, value in values.items()):
+        known = all(name in self._set and 0 <= value <= 255 for name, value in values.items())
+        if not (self.powered and values and known):
             return False
         was_active = self._set["ACT"]
         self._set |= values
@@ -125,7 +114,7 @@ class GripperModel:
             self._set["GTO"] = 0
             self.target = self._measured
         elif self._set["ACT"] and not was_active:
-            self._status, self._fault, self._activating = ACTIVATING, self.cause, ACTIVATION_SECONDS
+            self._status, self._fault, self._activating = ACTIVATING, self._cause, ACTIVATION_SECONDS
             self._set["POS"] = values.get("POS", 0)
         elif self._status == ACTIVATING and "POS" in values:
             self._fault = self._fault or ACTIVATING_FAULT
@@ -145,14 +134,12 @@ class GripperModel:
 
     def answer(self, line: str) -> str:
         """Answers a request of the URCap's text protocol: `SET ACT 1 GTO 1` with `ack`, `GET POS` with `POS 3`."""
-        words = line.split()
-        if len(words) == 2 and words[0] == "GET":
-            return f"{words[1]} {self.get(words[1])}\n"
-        if words[:1] == ["SET"] and len(words) % 2:
-            try:
-                values = {name: round(float(value)) for name, value in zip(words[1::2], words[2::2], strict=True)}
-            except (ValueError, OverflowError):
-                return "?\n"
-            # Clients compare with exactly these three letters: no end of line.
-            return "ack" if self.set(values) else "?\n"
+        match line.split():
+            case ["GET", name]:
+                return f"{name} {self.get(name)}\n"
+            case ["SET", *words]:
+                with contextlib.suppress(ValueError, OverflowError):
+                    values = zip(words[::2], words[1::2], strict=True)
+                    if self.set({name: round(float(value)) for name, value in values}):
+                        return "ack"  # clients compare with exactly these three letters: no end of line
         return "?\n"

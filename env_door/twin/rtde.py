@@ -12,8 +12,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+from env_door.twin.arm import TIME_STEP
 from env_door.twin.controller import REGISTERS, VERSION, Controller, ProgramState, RobotMode, SafetyMode
-from env_door.twin.motion import TIME_STEP
 
 logger = logging.getLogger(__name__)
 
@@ -55,6 +55,7 @@ INPUTS = _by_name(
 )
 INPUTS = {name: kind for name, kind in INPUTS.items() if not name.startswith("output_")}
 
+POWERED = (RobotMode.IDLE, RobotMode.RUNNING)
 JOINT_MODES = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255, RobotMode.BOOTING: 247, RobotMode.POWER_OFF: 239}
 SAFETY_BITS = {
     SafetyMode.NORMAL: 1 << 0,
@@ -66,23 +67,15 @@ Reading = Callable[[], tuple[float, ...]]
 
 
 class RTDEServer:
-    """All clients of RTDE.
-
-    Attributes:
-        sessions (`set[RTDESession]`): The clients.
-        delay (`float`): Seconds by which measurements reach the clients late.
-        frozen (`bool`): Whether measurements are withheld.
-        arrivals (`deque[float]`): Real time in s, `time.monotonic()`, at which the last inputs came.
-        owners (`dict[str, RTDESession]`): Who writes an input; a second one is refused.
-    """
+    """All clients of RTDE, what they may read, and who writes which input: a second one is refused."""
 
     def __init__(self, controller: Controller):
         self.controller = controller
         self.sessions: set[RTDESession] = set()
-        self.delay = 0.0
-        self.frozen = False
-        self.arrivals: deque[float] = deque(maxlen=MAX_ARRIVALS)
         self.owners: dict[str, RTDESession] = {}
+        self.delay = 0.0  # seconds by which measurements reach the clients late
+        self.frozen = False  # whether measurements are withheld and nothing is taken in
+        self.arrivals: deque[float] = deque(maxlen=MAX_ARRIVALS)  # real times in s at which inputs came
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answers the packages of one client; hangs up at a malformed one."""
@@ -91,7 +84,11 @@ class RTDEServer:
         try:
             while True:
                 size, kind = HEADER.unpack(await reader.readexactly(HEADER.size))
-                session.handle(chr(kind), await reader.readexactly(size - HEADER.size))
+                body = await reader.readexactly(size - HEADER.size)
+                while self.frozen:
+                    await asyncio.sleep(TIME_STEP)
+                if not writer.is_closing():
+                    session.handle(chr(kind), body)
         except (struct.error, ValueError) as error:
             logger.warning("RTDE client sent a malformed package (%s): hung up", error)
         finally:
@@ -130,15 +127,13 @@ class RTDEServer:
             "speed_scaling": lambda: (float(controller.may_move),),
             "target_speed_fraction": lambda: (1.0,),
             "runtime_state": lambda: (controller.program_state,),
-            "robot_status_bits": self._status_bits,
+            "robot_status_bits": lambda: (
+                (controller.robot_mode in POWERED) | (controller.program_state == ProgramState.PLAYING) << 1,
+            ),
             "safety_status_bits": lambda: (SAFETY_BITS[controller.safety_mode],),
         }
         zeros = (0,) * _count(OUTPUTS[name])
         return known.get(name, lambda: zeros)
-
-    def _status_bits(self) -> tuple[int]:
-        powered = self.controller.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING)
-        return (powered | (self.controller.program_state == ProgramState.PLAYING) << 1,)
 
 
 class RTDESession:
@@ -146,36 +141,30 @@ class RTDESession:
 
     def __init__(self, server: RTDEServer, writer: asyncio.StreamWriter):
         self._server, self._writer = server, writer
-        self._inputs: dict[int, tuple[list[str], struct.Struct]] = {}
+        self._inputs: list[tuple[list[str], struct.Struct]] = []
         self._readings: list[Reading] = []
-        self._format = struct.Struct(">B")
-        self._every = 1
         self._started = False
         self._ticks = 0
-        self._late: deque[tuple[float, bytes]] = deque()
+        self._due: deque[tuple[float, bytes]] = deque()
 
     def publish(self) -> None:
         """Sends the measurements if it is time for them; called every 2 ms."""
         self._ticks += 1
         now = self._server.controller.time
-        while self._late and self._late[0][0] <= now:
-            self._send("U", self._late.popleft()[1])
         # A controller that cannot keep up skips packages rather than to send old ones.
-        if not self._started or self._ticks % self._every or self._writer.transport.get_write_buffer_size():
-            return
-        body = self._format.pack(1, *(value for reading in self._readings for value in reading()))
-        if self._server.delay > 0 or self._late:
-            self._late.append((now + self._server.delay, body))
-        else:
-            self._send("U", body)
+        if self._started and not self._ticks % self._every and not self._writer.transport.get_write_buffer_size():
+            body = self._format.pack(1, *(value for reading in self._readings for value in reading()))
+            self._due.append((now + self._server.delay, body))
+        while self._due and self._due[0][0] <= now:
+            self._send("U", self._due.popleft()[1])
 
     def handle(self, kind: str, body: bytes) -> None:
         """Takes in a package and answers it; raises a ValueError or `struct.error` if it is malformed."""
         match kind:
             case "U":  # inputs
-                if not body or body[0] not in self._inputs:
+                if not body or not 1 <= body[0] <= len(self._inputs):
                     raise ValueError(f"unknown input recipe {body[:1].hex() or 'none'}")
-                names, layout = self._inputs[body[0]]
+                names, layout = self._inputs[body[0] - 1]
                 for name, value in zip(names, layout.unpack(body[1:]), strict=True):
                     self._server.controller.write_input(name, value)
                 self._server.arrivals.append(time.monotonic())
@@ -187,39 +176,33 @@ class RTDESession:
                 self._send(kind, self._agree_on_outputs(body))
             case "I":
                 self._send(kind, self._agree_on_inputs(body))
-            case "S":  # start
-                self._started = bool(self._readings)
-                self._send(kind, struct.pack(">?", self._started))
-            case "P":  # pause
-                self._started = False
-                self._send(kind, struct.pack(">?", True))
+            case "S" | "P":  # start, pause
+                self._started = kind == "S" and bool(self._readings)
+                self._send(kind, struct.pack(">?", self._started or kind == "P"))
             case _:
                 logger.warning("RTDE package of unknown type %r ignored", kind)
 
     def _agree_on_outputs(self, body: bytes) -> bytes:
         (frequency,), names = struct.unpack_from(">d", body), _names(body[8:])
         types = [OUTPUTS.get(name, "NOT_FOUND") for name in names]
-        answer = ",".join(types).encode()
-        if "NOT_FOUND" in types or not names or not 1 <= frequency <= 1 / TIME_STEP:
-            self._readings = []
-            return b"\x00" + answer
-        self._every = max(1, round(1 / (TIME_STEP * frequency)))
-        self._readings = [self._server.reading(name) for name in names]
-        self._format = struct.Struct(">B" + "".join(FORMATS[one] for one in types))
-        return b"\x01" + answer
+        known = "NOT_FOUND" not in types and bool(names) and 1 <= frequency <= 1 / TIME_STEP
+        self._readings = [self._server.reading(name) for name in names] if known else []
+        self._started &= known
+        if known:
+            self._every = max(1, round(1 / (TIME_STEP * frequency)))
+            self._format = struct.Struct(">B" + "".join(FORMATS[one] for one in types))
+        return bytes([known]) + ",".join(types).encode()
 
     def _agree_on_inputs(self, body: bytes) -> bytes:
         names, owners = _names(body), self._server.owners
         types = ["IN_USE" if owners.get(name, self) is not self else INPUTS.get(name, "NOT_FOUND") for name in names]
-        answer = ",".join(types).encode()
-        if not set(types) <= set(FORMATS):
-            return b"\x00" + answer
-        owners.update(dict.fromkeys(names, self))
-        identity = len(self._inputs) + 1
-        # One name for each number: no vector is a register, so what its numbers are called does not matter.
-        fields = [name for name, one in zip(names, types, strict=True) for _ in range(_count(one))]
-        self._inputs[identity] = (fields, struct.Struct(">" + "".join(FORMATS[one] for one in types)))
-        return bytes([identity]) + answer
+        known = set(types) <= set(FORMATS)
+        if known:
+            owners.update(dict.fromkeys(names, self))
+            # One name for each number: no vector is a register, so what its numbers are called does not matter.
+            fields = [name for name, one in zip(names, types, strict=True) for _ in range(_count(one))]
+            self._inputs.append((fields, struct.Struct(">" + "".join(FORMATS[one] for one in types))))
+        return bytes([len(self._inputs) if known else 0]) + ",".join(types).encode()
 
     def _send(self, kind: str, body: bytes) -> None:
         if not self._writer.is_closing():

@@ -17,62 +17,51 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from env_door.twin.arm import TIME_STEP
 from env_door.twin.controller import Controller, ScriptError
-from env_door.twin.motion import TIME_STEP
-from env_door.twin.ports import Serve
 
 logger = logging.getLogger(__name__)
 
 READY, DONE = 1, 2
 STOP_SCRIPT = 255
 STREAMED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}  # read anew every 2 ms
-STILL = 0.01  # joint speed in rad/s below which the arm counts as steady
+STEADY = 0.01  # joint speed in rad/s below which the arm counts as steady
 
 _NAME = re.compile(r"^def\s+(\w+)\s*\(", re.MULTILINE)
 _OFFSET = re.compile(r"global reg_offset_int = # int register offset\s+(\d+)")
 
 
-def serve_uploads(controller: Controller) -> Serve:
-    """A handler of clients that upload programs; a program runs on when the client that uploaded it leaves."""
-
-    async def serve(reader: asyncio.StreamReader, _: asyncio.StreamWriter) -> None:
-        while True:  # a program is whole at its first `end` at the start of a line
-            source = (await reader.readuntil(b"\nend\n")).decode("utf-8", "replace")
-            match = _NAME.search(source)
-            name = match[1] if match else "without a name"
-            if name == "rtde_control":
-                controller.start_program(UploadedScript(controller, source).run(), name)
-            else:
-                logger.error("program %s is not emulated (only ur_rtde's rtde_control is): ignored", name)
-
-    return serve
+async def serve_uploads(controller: Controller, reader: asyncio.StreamReader, _: asyncio.StreamWriter) -> None:
+    """Takes programs from a client; they run on when it leaves."""
+    while True:  # a program is whole at its first `end` at the start of a line
+        source = (await reader.readuntil(b"\nend\n")).decode("utf-8", "replace")
+        name = match[1] if (match := _NAME.search(source)) else "without a name"
+        if name == "rtde_control":
+            controller.start_program(UploadedScript(controller, source).run())
+        else:
+            logger.error("program %s is not emulated (only ur_rtde's rtde_control is): ignored", name)
 
 
 class UploadedScript:
     """One run of ur_rtde's control script, whose source says which half of the registers it uses."""
 
     def __init__(self, controller: Controller, source: str):
-        self._controller, self._motion = controller, controller.motion
-        match = _OFFSET.search(source)
-        self._offset = int(match[1]) if match else 0
+        self._controller, self._motion, self._registers = controller, controller.motion, controller.registers
+        self._offset = int(match[1]) if (match := _OFFSET.search(source)) else 0
         self._async_writes = self._async_operations = 0
-        self._async_moving = False
 
     def run(self) -> Iterator[None]:
         """The script's main loop; a ScriptError ends it."""
         executing = False
-        self._signal_async(-1)
+        self._signal_async(running=False)
         self._answer(0, READY)
-        while True:
-            command = self._integer(0)
+        while (command := self._integer(0)) != STOP_SCRIPT:
             if command in STREAMED:
                 yield from self._carry_out(command)
                 self._answer(0, READY)
             elif command == 0:
                 executing = False
                 self._answer(0, READY)
-            elif command == STOP_SCRIPT:
-                return
             elif not executing:
                 yield from self._carry_out(command)
                 self._answer(0, DONE)
@@ -85,8 +74,7 @@ class UploadedScript:
         controller, motion, door = self._controller, self._motion, self._controller.door
         match command:
             case 1:  # movej
-                self._refuse_during("servo", "servoStop")
-                self._end_async_move()
+                self._take_over()
                 motion.move(self._joint_arguments(), speed=self._argument(6), acceleration=self._argument(7))
                 yield from self._until_still_unless_async()
             case 8 | 17:  # zero_ftsensor, set_payload
@@ -105,8 +93,7 @@ class UploadedScript:
                 controller.protective_stop("asked for by the client")
                 yield  # the program is paused right here, before it could answer
             case 33 | 34:  # stopl, stopj
-                self._refuse_during("servo", "servoStop")
-                self._end_async_move()
+                self._take_over()
                 motion.stop(self._argument(0))
                 yield from self._until_still_unless_async()
             case 35:  # set_watchdog
@@ -121,15 +108,15 @@ class UploadedScript:
             case 43:  # get_forward_kinematics_default
                 self._answer_with(door.tool_pose(controller.tool_offset))
             case 47:  # is_steady
-                self._answer(1, int(motion.kind == "hold" and np.abs(door.joint_speeds).max() < STILL))
+                self._answer(1, int(motion.kind == "hold" and np.abs(door.joint_speeds).max() < STEADY))
             case _:
                 raise ScriptError(f"command {command} of ur_rtde is not emulated")
 
     def _integer(self, index: int) -> int:
-        return int(self._controller.registers[f"input_int_register_{self._offset + index}"])
+        return int(self._registers[f"input_int_register_{self._offset + index}"])
 
     def _argument(self, index: int) -> float:
-        return self._controller.registers[f"input_double_register_{self._offset + index}"]
+        return self._registers[f"input_double_register_{self._offset + index}"]
 
     def _joint_arguments(self) -> NDArray[np.float64]:
         values = np.array([self._argument(index) for index in range(6)])
@@ -138,11 +125,15 @@ class UploadedScript:
         return values
 
     def _answer(self, index: int, value: int) -> None:
-        self._controller.registers[f"output_int_register_{self._offset + index}"] = value
+        self._registers[f"output_int_register_{self._offset + index}"] = value
 
     def _answer_with(self, values: Iterable[float]) -> None:
         for index, value in enumerate(values):
-            self._controller.registers[f"output_double_register_{self._offset + index}"] = float(value)
+            self._registers[f"output_double_register_{self._offset + index}"] = float(value)
+
+    def _take_over(self) -> None:
+        self._refuse_during("servo", "servoStop")
+        self._end_async_move()
 
     def _refuse_during(self, kind: str, stop: str) -> None:
         if self._motion.kind == kind:
@@ -154,20 +145,17 @@ class UploadedScript:
 
     def _until_still_unless_async(self) -> Iterator[None]:
         if self._integer(1) == 1:
-            self._signal_async(0)
-            self._async_moving = True
+            self._signal_async(running=True)
         else:
             yield from self._until_still()
 
     def _end_async_move(self) -> None:
-        if self._async_moving:
-            self._async_moving = False
-            self._signal_async(-1)
+        if self._async_running:
+            self._signal_async(running=False)
 
-    def _signal_async(self, progress: int) -> None:
-        # Output register 2: counters of writes and operations, whether one runs (bit 15) and how far it is.
+    def _signal_async(self, running: bool) -> None:
+        # Output register 2: counters of writes and operations, and whether one runs (bit 15); how far it is stays 0.
+        self._async_running = running
         self._async_writes = (self._async_writes + 1) % 128
-        if progress == 0:
-            self._async_operations = (self._async_operations + 1) % 128
-        value = self._async_writes << 16 | self._async_operations << 24
-        self._answer(2, value | (progress | 1 << 15 if progress >= 0 else 0))
+        self._async_operations = (self._async_operations + running) % 128
+        self._answer(2, self._async_writes << 16 | self._async_operations << 24 | running << 15)

@@ -8,22 +8,55 @@ import asyncio
 import inspect
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from env_door.checks import check_choice, check_range
+from env_door.latch import KINDS
+from env_door.limits import MAX_HOLD, MAX_OFFSET
 from env_door.twin import ports
+from env_door.twin.arm import TIME_STEP, LiveDoor
 from env_door.twin.camera import Camera
-from env_door.twin.configuration import TwinConfig
-from env_door.twin.controller import Controller, Dashboard
-from env_door.twin.injections import Injections
-from env_door.twin.live_door import LiveDoor
-from env_door.twin.motion import TIME_STEP
+from env_door.twin.controller import Controller, serve_dashboard
+from env_door.twin.injections import find
 from env_door.twin.ports import Port, Serve, lines
 from env_door.twin.rtde import RTDEServer
 from env_door.twin.script import serve_uploads
 
 MAX_LAG = 0.25  # seconds by which the twin may be late and still catch up; beyond, it lets the time go
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """A door with a robot in front of it that listens like a real UR5e."""
+
+    address: str = "127.0.0.2"
+    """IPv4 address to listen on. The ports are fixed, as on a real robot; several twins need several addresses
+    (127.0.0.2, 127.0.0.3, ...; Linux has them all). ur_rtde skips its check of remote control on 127.0.0.1."""
+    kind: str = "random"
+    """Kind of the door: push, pull, slide or random."""
+    seed: int = 0
+    """Seed of the first trial: kind, start pose and the door's shift."""
+    door_offset: float = 0.0
+    """Half-width in m, 0 to 0.05, of the range of the door's sideways shift."""
+    hold_seconds: float = 0.0
+    """Seconds, 0 to 60, for which somebody holds the door once it has begun to open."""
+    camera: bool = True
+    """Whether there is a camera; it needs pyzmq."""
+    unlock_seconds: float = 5.0
+    """Seconds after a protective stop before it can be unlocked, as on a real controller."""
+    until_stdin_closes: bool = False
+    """Whether the twin ends with the process at the other end of its standard input, which writes nothing there."""
+
+    def __post_init__(self) -> None:
+        check_choice(self, "kind", (*KINDS, "random"))
+        check_range(self, "seed", low=0)
+        check_range(self, "door_offset", low=0.0, high=MAX_OFFSET, unit="m")
+        check_range(self, "hold_seconds", low=0.0, high=MAX_HOLD, unit="s")
+        check_range(self, "unlock_seconds", low=0.0, high=3600.0, unit="s")
 
 
 class Twin:
@@ -34,24 +67,24 @@ class Twin:
         self._lost = 0.0
         self._trial_start = 0.0
         self.door = LiveDoor(config.kind, config.door_offset, config.hold_seconds)
-        self.door.place(config.seed, None, keep_arm=False)
+        self.door.reset(seed=config.seed)
         self.controller: Controller = Controller(self.door, config.unlock_seconds)
         self.rtde: RTDEServer = RTDEServer(self.controller)
-        self.camera = Camera(config.address, config.camera_fps, self.door.model.nq) if config.camera else None
-        self.injections = Injections(self)
+        self.camera = Camera(config.address, self.door.model.nq) if config.camera else None
         self.stopped = asyncio.Event()
-        self._actions: dict[str, Callable[..., Any]] = {
+        self._active: list[str] = []  # injections that last
+        self._requests: dict[str, Callable[..., Any]] = {
             "state": self.state,
             "reset": self.reset,
             "hold": self.door.hold_door,
             "arrivals": lambda: {"arrivals": self.rtde.take_arrivals()},
-            "inject": self.injections.start,
-            "clear": self.injections.clear,
+            "inject": self.inject,
+            "clear": self.clear,
         }
         handlers: dict[int, Serve] = {
             ports.RTDE: self.rtde.serve,
-            **dict.fromkeys(ports.SCRIPT, serve_uploads(self.controller)),
-            ports.DASHBOARD: Dashboard(self.controller).serve,
+            **dict.fromkeys(ports.SCRIPT, partial(serve_uploads, self.controller)),
+            ports.DASHBOARD: partial(serve_dashboard, self.controller),
             ports.GRIPPER: self.controller.gripper.serve,
             ports.TWIN: self._serve_requests,
         }
@@ -96,7 +129,6 @@ class Twin:
     def state(self) -> dict[str, Any]:
         """What is the case, whatever clients are told; see [`~env_door.twin.TwinClient.state`]."""
         latch, controller = self.door.latch, self.controller
-        joints = np.append(self.door.joints, self.door.closure)
         targets = np.append(controller.motion.position, controller.gripper.target)
         return {
             "kind": latch.kind,
@@ -108,7 +140,7 @@ class Twin:
             "seed": self._seed,
             "time": controller.time - self._trial_start,
             "controller_time": controller.time,
-            "joints": dict(zip(self.door.joint_names, joints.tolist(), strict=True)),
+            "joints": dict(zip(self.door.joint_names, self.door.measured_joints().tolist(), strict=True)),
             "targets": dict(zip(self.door.joint_names, targets.tolist(), strict=True)),
             "arm_speed": float(np.abs(self.door.joint_speeds).max()),
             "motion": controller.motion.kind,
@@ -117,23 +149,44 @@ class Twin:
             "program": controller.program_state.name,
             "watchdog": controller.watchdog is not None,
             "rtde_clients": len(self.rtde.sessions),
-            "injections": self.injections.active,
-            "pictures": self.camera.drawn if self.camera is not None else 0,
+            "injections": list(self._active),
+            "pictures": self.camera.drawn.value if self.camera is not None else 0,
             "lost_seconds": self._lost,
         }
 
-    def reset(self, kind: str | None = None, seed: int | None = None, keep_arm: bool = False) -> dict[str, Any]:
+    def reset(self, kind: str | None = None, seed: int | None = None) -> dict[str, Any]:
         """Starts a new trial and returns the state; see [`~env_door.twin.TwinClient.reset`]."""
         seed = self._seed + 1 if seed is None else seed
         if not isinstance(seed, int) or seed < 0:
             raise ValueError(f"seed={seed!r} must be a whole number that is not negative")
-        self.door.place(seed, kind, keep_arm)
+        self.door.reset(seed=seed, options={} if kind is None else {"kind": kind})
         self._seed = seed
         self._trial_start = self.controller.time
-        if not keep_arm:
-            self.controller.gripper.open_at_once()
-            self.controller.settle()
+        self.controller.gripper.open_at_once()
+        self.controller.settle()
         return self.state()
+
+    def inject(self, name: str, **parameters: Any) -> None:
+        """Makes something fail; raises a ValueError if it does not exist, or a parameter is unknown or out of range."""
+        start, clear = find(name)
+        try:
+            start(self, **parameters)
+        except TypeError as error:
+            known = list(inspect.signature(start).parameters)[1:]
+            raise ValueError(f"injection {name!r}: {error}; its parameters are {known}") from error
+        if callable(clear) and name not in self._active:
+            self._active.append(name)
+
+    async def clear(self, name: str | None = None) -> None:
+        """Undoes a condition, or all that last; raises a ValueError if it does not exist or is an event."""
+        for one in list(self._active) if name is None else [name]:
+            clear = find(one).clear
+            if isinstance(clear, str):
+                raise ValueError(f"injection {one!r} is an event and cannot be cleared: {clear}")
+            if one in self._active:
+                self._active.remove(one)
+                if (waiting := clear(self)) is not None:
+                    await waiting
 
     async def _serve_requests(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answers JSON lines such as `{"do": "inject", "name": "freeze"}` with `{"ok": true, ...}`."""
@@ -145,8 +198,8 @@ class Twin:
             writer.write(json.dumps(answer).encode() + b"\n")
 
     async def _carry_out(self, request: Any) -> dict[str, Any]:
-        if not isinstance(request, dict) or request.get("do") not in self._actions:
-            known = sorted(self._actions)
+        if not isinstance(request, dict) or request.get("do") not in self._requests:
+            known = sorted(self._requests)
             raise ValueError(f'request {request!r} is unknown; it must be {{"do": one of {known}, ...}}')
-        answer = self._actions[request.pop("do")](**request)
+        answer = self._requests[request.pop("do")](**request)
         return (await answer if inspect.isawaitable(answer) else answer) or {}

@@ -2,15 +2,14 @@
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from ..foresight import uncertainty
 from ..modeling_ufrnn import UFRNNPolicy
+from .picture import picture
 from .trial import Imagination, TrialHistory
 
 MOST_SHOWN = 5
@@ -22,36 +21,32 @@ def draw(policy: UFRNNPolicy, history: TrialHistory, path: Path) -> None:
     Top: the camera, its reconstruction, and imagined images at the horizon. Below: the imagined paths of the joint that
     the candidates disagree most about, and the predicted variance over the whole trial.
     """
-    imagined = decisive(history, policy.model.network.joint_dim)
-    camera, joint_dim = policy.config.cameras[0], policy.model.network.joint_dim
-    shown = _representatives(imagined, joint_dim)
-    pictures = _decode(policy, imagined.futures.mean[-1, shown, joint_dim:], camera)  # (n, height, width, 3)
-    image = torch.from_numpy(history.images[imagined.step]).permute(2, 0, 1)[None].to(imagined.futures.mean.device)
+    joint_dim = policy.model.network.joint_dim
+    imagined = decisive(history, joint_dim)
+    ends, photo = imagined.futures.mean[-1], history.images[imagined.step]
+    shown = _representatives(ends[:, :joint_dim], imagined.chosen)
+    image = torch.from_numpy(photo).permute(2, 0, 1)[None].to(ends.device)
     with torch.no_grad():
         seen = policy.image_encoder(dict.fromkeys(policy.config.cameras, image))
-    reconstruction = _decode(policy, seen, camera)[0]
-
-    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(2 * (len(shown) + 2), 6), layout="constrained")
+        decoded = policy.image_encoder.decode(torch.cat((seen, ends[shown, joint_dim:])))[policy.config.cameras[0]]
+    pictures = [photo, *decoded.clamp(0, 1).permute(0, 2, 3, 1).cpu().numpy()]
+    with picture(path, 2 * len(pictures), 6, dpi=110) as figure:
         top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.1)))
-        panels = top.subplots(1, len(shown) + 2)
+        panels = top.subplots(1, len(pictures))
         titles = [f"camera, step {imagined.step}", "reconstruction"]
         titles += [_title(policy, imagined, number) for number in shown]
-        for index, (panel, picture, title) in enumerate(
-            zip(panels, [history.images[imagined.step], reconstruction, *pictures], titles, strict=True)
-        ):
-            kept = index >= 2 and shown[index - 2] == imagined.chosen
-            panel.imshow(picture)
+        for panel, shot, title, number in zip(panels, pictures, titles, [None, None, *shown], strict=True):
+            kept = number == imagined.chosen
+            panel.imshow(shot)
             panel.set_title(title, fontsize=9, color="C3" if kept else "black")
-            _frame(panel, kept)
+            panel.set(xticks=[], yticks=[])
+            for spine in panel.spines.values():
+                spine.set(visible=kept, color="C3", linewidth=3)
         paths, uncertainties = bottom.subplots(1, 2)
         _draw_paths(paths, policy, history, imagined)
         _draw_uncertainty(uncertainties, history, imagined)
-        tried = ", ".join(direction for _, direction in history.attempts) or "nothing"
-        result = "opened" if history.success else "not opened"
+        tried, result = history.outcome
         figure.suptitle(f"What was imagined (in truth a {history.door_kind} door; tried: {tried}; {result})")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
 
 
 def decisive(history: TrialHistory, joint_dim: int) -> Imagination:
@@ -75,10 +70,9 @@ def decisive(history: TrialHistory, joint_dim: int) -> Imagination:
     return max(near, key=lambda imagined: imagined.futures.mean[-1].std(dim=0).mean().item())
 
 
-def _representatives(imagined: Imagination, joint_dim: int) -> list[int]:
-    """The kept candidate and others that differ: each next one is the farthest from those before (k-centre)."""
-    ends = imagined.futures.mean[-1, :, :joint_dim]
-    shown = [imagined.chosen]
+def _representatives(ends: Tensor, chosen: int) -> list[int]:
+    """The kept candidate of (N, D_j) and others that differ: each next one is the farthest from those before."""
+    shown = [chosen]
     while len(shown) < min(MOST_SHOWN, len(ends)):
         distance = torch.cdist(ends, ends[shown]).amin(1)
         distance[shown] = -1
@@ -95,13 +89,6 @@ def _title(policy: UFRNNPolicy, imagined: Imagination, number: int) -> str:
     return f"future {number + 1}{kept}\nuncertainty {final:.3g}"
 
 
-def _frame(panel: Axes, kept: bool) -> None:
-    panel.set_xticks([])
-    panel.set_yticks([])
-    for spine in panel.spines.values():
-        spine.set(visible=kept, color="C3", linewidth=3)
-
-
 def _draw_paths(axes: Axes, policy: UFRNNPolicy, history: TrialHistory, imagined: Imagination) -> None:
     joint_dim, step, chosen = policy.model.network.joint_dim, imagined.step, imagined.chosen
     paths = policy.joint_scaler.unscale(imagined.futures.mean[..., :joint_dim]).cpu().numpy()  # (T, N, D_j)
@@ -111,11 +98,9 @@ def _draw_paths(axes: Axes, policy: UFRNNPolicy, history: TrialHistory, imagined
     measured = np.array([joints[joint] for joints in history.joints[start:]])
     axes.plot(np.arange(start, start + len(measured)), measured, color="black", linewidth=1.5, label="what happened")
     future = np.arange(step + imagined.ahead, step + imagined.ahead + len(paths))
-    others = np.delete(paths[:, :, joint], chosen, axis=1)
-    if others.size:
-        faint = 1.0 if others.shape[1] < 10 else 0.35
-        axes.plot(future, others[:, 0], color="C0", linewidth=1, alpha=faint, label="imagined")
-        axes.plot(future, others[:, 1:], color="C0", linewidth=1, alpha=faint)
+    for number, other in enumerate(np.delete(paths[:, :, joint], chosen, axis=1).T):
+        alpha = 1.0 if paths.shape[1] <= 10 else 0.35
+        axes.plot(future, other, color="C0", linewidth=1, alpha=alpha, label=None if number else "imagined")
     axes.plot(future, paths[:, chosen, joint], color="C3", linewidth=2.5, label="imagined and kept")
     axes.axvline(step, color="grey", linewidth=0.8, linestyle=":")
     axes.set(xlabel="step (10 Hz)", ylabel=f"{history.joint_names[joint]} (rad)", xlim=(start, step + len(paths) + 25))
@@ -135,9 +120,3 @@ def _draw_uncertainty(axes: Axes, history: TrialHistory, imagined: Imagination) 
     axes.set(xlabel="step (10 Hz)", ylabel="mean predicted variance")
     axes.set_title("Uncertainty over the trial", fontsize=10)
     axes.legend(frameon=False)
-
-
-@torch.no_grad()
-def _decode(policy: UFRNNPolicy, scaled_features: Tensor, camera: str) -> np.ndarray:
-    images = policy.image_encoder.decode(scaled_features)[camera]
-    return images.clamp(0, 1).permute(0, 2, 3, 1).cpu().numpy()

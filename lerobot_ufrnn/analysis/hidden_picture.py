@@ -1,161 +1,113 @@
 """A picture of hidden states on their plane: demonstrations dotted, a trial solid (UF-RNN, Figs. 5 and 7)."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import matplotlib
-import numpy as np
 import pandas as pd
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ..networks import HiddenState
-from .colors import DOOR_COLORS
 from .hidden_states import Plane
+from .picture import DOOR_COLORS, picture
 from .trial import TrialHistory
 
 OTHER_COLOR = "#999999"
-HELD_COLOR = "#ffcc33"
-PANELS_PER_ROW = 3
+HELD: dict[str, Any] = {"color": "#ffcc33", "linewidth": 6.0, "alpha": 0.6}
+MARKERS: dict[str, dict[str, Any]] = {
+    "start of the trial": {"marker": ".", "markersize": 8, "markerfacecolor": "black"},
+    "first try": {"marker": "o", "markersize": 9},
+    "further try": {"marker": "s", "markersize": 5},
+    "opened": {"marker": "*", "markersize": 13},
+}
 DOT_SPACING = 4.5
 """From dot to dot of a dotted line, in line widths."""
 
 
-@dataclass(frozen=True)
-class HiddenPaths:
-    """`h_shared` of one model on the plane of its demonstrations.
+class HiddenPaths(NamedTuple):
+    """`h_shared` of one model on the plane of its demonstrations."""
 
-    Attributes:
-        label (`str`): name of the model.
-        kinds (`list[str]`): kind of each demonstration.
-        demonstrations (`list[np.ndarray]`): path of each, (L, 2).
-        trial (`np.ndarray`): path of the trial, (L, 2).
-        shares (`tuple[float, float]`): share of the demonstrations' variance along each axis.
-        history (`TrialHistory`): the trial.
-    """
-
-    label: str
-    kinds: list[str]
-    demonstrations: list[np.ndarray]
-    trial: np.ndarray
-    shares: tuple[float, float]
+    table: pd.DataFrame  # a row a step: path (number of the demonstration, or trial), kind, step, pc1, pc2, tried, held
+    shares: Sequence[float]  # share of the demonstrations' variance along each axis
     history: TrialHistory
 
+    @property
+    def demonstrations(self) -> pd.DataFrame:
+        """`pd.DataFrame`: the table without the trial."""
+        return self.table[self.table["path"] != "trial"]
+
     @classmethod
-    def of(cls, label: str, kinds: list[str], states: Sequence[HiddenState], history: TrialHistory) -> "HiddenPaths":
-        """Fits the plane to the states along demonstrations and puts them and a trial on it."""
+    def of(cls, kinds: Sequence[str], states: Sequence[HiddenState], history: TrialHistory) -> "HiddenPaths":
+        """Fits the plane to the states along demonstrations of these kinds, and puts them and a trial on it."""
         plane = Plane.fit(torch.cat([of_episode.h_shared for of_episode in states]))
-        first, second = plane.shares.tolist()
-        return cls(
-            label,
-            kinds,
-            [plane.project(of_episode.h_shared).cpu().numpy() for of_episode in states],
-            plane.project(HiddenState.stack(history.states).h_shared[:, 0]).cpu().numpy(),
-            (first, second),
-            history,
-        )
+        paths = [(str(number), *path) for number, path in enumerate(zip(kinds, states, strict=True))]
+        paths.append(("trial", history.door_kind, HiddenState.stack(history.states).at((slice(None), 0))))
+        parts = []
+        for name, kind, of_path in paths:
+            points = plane.project(of_path.h_shared).cpu().numpy()
+            part = pd.DataFrame({"path": name, "kind": kind, "step": range(len(points))})
+            parts.append(part.assign(pc1=points[:, 0], pc2=points[:, 1]))
+        table = pd.concat(parts, ignore_index=True)
+        in_trial = table["path"] == "trial"
+        table["tried"] = table["step"].where(in_trial).map(dict(history.attempts)).fillna("")
+        table["held"] = (in_trial & table["step"].isin(history.held)).astype(int)
+        return cls(table, plane.shares.tolist(), history)
 
 
-def draw(models: Sequence[HiddenPaths], path: Path) -> None:
-    """Draws a panel a model and writes them to `path`, whose ending chooses the format.
+def draw(models: Mapping[str, HiddenPaths], path: Path) -> None:
+    """Draws a panel a model and writes them to `path`.
 
     Each demonstration is a pale line, the mean of each kind a dotted one. The trial is the black line; what it tries
     shows in the colour of that kind, and the time for which somebody held the door is highlighted.
     """
-    num_columns = min(len(models), PANELS_PER_ROW)
-    num_rows = -(-len(models) // num_columns)
-    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(3.4 * num_columns, 0.6 + 3.2 * num_rows), layout="constrained")
-        panels = figure.subplots(num_rows, num_columns, squeeze=False).flatten()
-        for panel, model in zip(panels, models, strict=False):
-            _draw_model(panel, model)
-        for panel in panels[len(models) :]:
-            panel.set_visible(False)
+    with picture(path, 3.4 * len(models), 3.8) as figure:
+        panels = figure.subplots(1, len(models), squeeze=False)[0]
+        for panel, (label, model) in zip(panels, models.items(), strict=True):
+            _draw_model(panel, label, model)
         kinds = dict.fromkeys(
-            kind for model in models for kind in (*model.kinds, *(way for _, way in model.history.attempts))
+            kind
+            for model in models.values()
+            for kind in (*model.demonstrations["kind"], *(way for _, way in model.history.attempts))
         )
-        figure.legend(
-            handles=_legend(list(kinds), with_held=any(model.history.held for model in models)),
-            loc="outside lower center",
-            ncols=min(4, 2 * num_columns),
-            frameon=False,
-        )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=150)
+        handles = [
+            Line2D([], [], color=_color(kind), linestyle=":", linewidth=2, label=f"{kind} (offline)") for kind in kinds
+        ]
+        handles.append(Line2D([], [], color="black", linewidth=0.8, label="trial (online)"))
+        if any(model.history.held for model in models.values()):
+            handles.append(Line2D([], [], label="door held", **HELD))
+        handles += [Line2D([], [], label=name, **_marker(name)) for name in MARKERS]
+        figure.legend(handles=handles, loc="outside lower center", ncols=min(4, 2 * len(models)), frameon=False)
 
 
-def _draw_model(panel: Axes, model: HiddenPaths) -> None:
-    kinds, history = list(dict.fromkeys(model.kinds)), model.history
-    for number, kind in enumerate(kinds):
-        color = DOOR_COLORS.get(kind, OTHER_COLOR)
-        paths = [path for path, of_kind in zip(model.demonstrations, model.kinds, strict=True) if of_kind == kind]
-        for path in paths:
-            panel.plot(*path.T, color=color, linewidth=0.5, alpha=0.2)
-        shortest = min(map(len, paths))
-        mean = np.mean([path[:shortest] for path in paths], axis=0)
+def _draw_model(panel: Axes, label: str, model: HiddenPaths) -> None:
+    history, trial = model.history, model.table.loc[model.table["path"] == "trial", ["pc1", "pc2"]].to_numpy()
+    kinds = model.demonstrations.groupby("kind", sort=False)
+    for number, (kind, of_kind) in enumerate(kinds):
+        paths = of_kind.pivot(index="step", columns="path", values=["pc1", "pc2"])
+        panel.plot(paths["pc1"], paths["pc2"], color=_color(kind), linewidth=0.5, alpha=0.2)
+        mean = [paths.dropna()[axis].mean(axis=1) for axis in ("pc1", "pc2")]  # as long as the shortest
         # Dots of one kind fall between those of the others where their paths agree.
         dots = (DOT_SPACING * number / len(kinds), (1, DOT_SPACING - 1))
-        panel.plot(*mean.T, color=color, linestyle=dots, linewidth=2)
-    if history.held:
-        panel.plot(*model.trial[history.held].T, color=HELD_COLOR, linewidth=6, alpha=0.6, solid_capstyle="round")
-    panel.plot(*model.trial.T, color="black", linewidth=0.8)
-    panel.plot(*model.trial[0], "k.", markersize=8)
+        panel.plot(*mean, color=_color(kind), linestyle=dots, linewidth=2)
+    panel.plot(*trial[history.held].T, solid_capstyle="round", **HELD)
+    panel.plot(*trial.T, color="black", linewidth=0.8)
+    panel.plot(*trial[0], **_marker("start of the trial"))
     for number, (step, direction) in enumerate(history.attempts):
-        panel.plot(
-            *model.trial[step],
-            marker="o" if number == 0 else "s",
-            markersize=9 if number == 0 else 5,
-            markerfacecolor=DOOR_COLORS.get(direction, OTHER_COLOR),
-            markeredgecolor="black",
-        )
+        panel.plot(*trial[step], **_marker("further try" if number else "first try", markerfacecolor=_color(direction)))
     if history.success:
-        panel.plot(*model.trial[-1], marker="*", markersize=13, markerfacecolor="white", markeredgecolor="black")
-    result = f"opened at step {len(model.trial) - 1}" if history.success else "not opened"
-    first_try = "no try"
-    if history.attempts:
-        first_try = f"first try {history.attempts[0].direction} at step {history.attempts[0].step}"
-    panel.set_title(f"{model.label}\n{history.door_kind} door: {first_try},\n{result}", fontsize=9)
+        panel.plot(*trial[-1], **_marker("opened"))
+    first_try = "first try {1} at step {0}".format(*history.attempts[0]) if history.attempts else "no try"
+    result = f"opened at step {len(trial) - 1}" if history.success else "not opened"
+    panel.set_title(f"{label}\n{history.door_kind} door: {first_try},\n{result}", fontsize=9)
     first, second = model.shares
     panel.set(xlabel=f"PC 1 ({first:.0%})", ylabel=f"PC 2 ({second:.0%})")
 
 
-def _legend(kinds: list[str], with_held: bool) -> list[Line2D]:
-    def marker(shape: str, size: float, face: str, label: str) -> Line2D:
-        style: dict[str, Any] = {
-            "markersize": size,
-            "markerfacecolor": face,
-            "markeredgecolor": "black",
-            "linestyle": "none",
-        }
-        return Line2D([], [], marker=shape, label=label, **style)
-
-    handles = [
-        Line2D([], [], color=DOOR_COLORS.get(kind, OTHER_COLOR), linestyle=":", linewidth=2, label=f"{kind} (offline)")
-        for kind in kinds
-    ]
-    handles.append(Line2D([], [], color="black", linewidth=0.8, label="trial (online)"))
-    if with_held:
-        handles.append(Line2D([], [], color=HELD_COLOR, linewidth=6, alpha=0.6, label="door held"))
-    handles.append(marker(".", 8, "black", "start of the trial"))
-    tries = [marker("o", 9, "white", "first try"), marker("s", 5, "white", "further try")]
-    return [*handles, *tries, marker("*", 13, "white", "opened")]
+def _color(kind: str) -> str:
+    return DOOR_COLORS.get(kind, OTHER_COLOR)
 
 
-def to_table(models: Sequence[HiddenPaths]) -> pd.DataFrame:
-    """The numbers: one row a step of a demonstration or of the trial, which says what was tried at it and if held."""
-    parts = []
-    for model in models:
-        names = [str(number) for number in range(len(model.kinds))] + ["trial"]
-        kinds = [*model.kinds, model.history.door_kind]
-        for name, kind, points in zip(names, kinds, [*model.demonstrations, model.trial], strict=True):
-            part = pd.DataFrame({"model": model.label, "path": name, "kind": kind, "step": range(len(points))})
-            part[["pc1", "pc2"]] = points
-            tried = dict(model.history.attempts) if name == "trial" else {}
-            part["tried"] = part["step"].map(tried).fillna("")
-            part["held"] = part["step"].isin(model.history.held if name == "trial" else []).astype(int)
-            parts.append(part)
-    return pd.concat(parts)
+def _marker(name: str, **style: Any) -> dict[str, Any]:
+    return {"linestyle": "none", "markeredgecolor": "black", "markerfacecolor": "white"} | MARKERS[name] | style

@@ -1,7 +1,7 @@
 """Hidden states along demonstrations, and their plane of largest variance."""
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -13,16 +13,7 @@ from ..networks import HiddenState
 
 
 def read_demonstrations(policy: UFRNNPolicy, dataset_dir: Path) -> list[Episode]:
-    """All episodes of a dataset, encoded by the policy's autoencoder.
-
-    Args:
-        policy (`UFRNNPolicy`):
-            Trained policy.
-        dataset_dir (`Path`):
-            Folder of a LeRobotDataset.
-
-    Returns:
-        `list[Episode]`: the episodes, with features in place of images.
+    """All episodes of a LeRobotDataset, with features of the policy's autoencoder in place of images.
 
     Raises:
         FileNotFoundError: If there is no dataset in that folder.
@@ -40,14 +31,7 @@ def read_demonstrations(policy: UFRNNPolicy, dataset_dir: Path) -> list[Episode]
 def states_along(policy: UFRNNPolicy, demonstrations: list[Episode]) -> list[HiddenState]:
     """Hidden states of the policy that reads demonstrations instead of acting (teacher forcing), exploring as it does.
 
-    Args:
-        policy (`UFRNNPolicy`):
-            Trained policy.
-        demonstrations (`list[Episode]`):
-            What it reads.
-
-    Returns:
-        `list[HiddenState]`: for each demonstration the state after each of its L steps, (L, hidden size) each.
+    For each demonstration the state after each of its L steps, (L, hidden size) each.
     """
     scaler, device = policy.image_encoder.scaler, policy.updates.device
     inputs = nn.utils.rnn.pad_sequence(
@@ -63,34 +47,23 @@ def states_along(policy: UFRNNPolicy, demonstrations: list[Episode]) -> list[Hid
         memory, _ = policy.model.advance(step_inputs, memory)
         states.append(memory.state)
     over_time = HiddenState.stack(states)  # (L, B, hidden size) each
-    return [
-        HiddenState(*(values[: len(episode), row] for values in over_time))
-        for row, episode in enumerate(demonstrations)
-    ]
+    return [over_time.at((slice(len(episode)), row)) for row, episode in enumerate(demonstrations)]
 
 
-@dataclass(frozen=True)
-class Plane:
-    """Plane through points along their two directions of largest variance (principal component analysis).
+class Plane(NamedTuple):
+    """Plane through points along their two directions of largest variance (principal component analysis)."""
 
-    Attributes:
-        origin (`Tensor`): mean of the points, (S,).
-        axes (`Tensor`): orthonormal directions, largest variance first, each with its largest entry positive, (2, S).
-        shares (`Tensor`): share of all variance along each, (2,).
-    """
-
-    origin: Tensor
-    axes: Tensor
-    shares: Tensor
+    origin: Tensor  # mean of the points, (S,)
+    axes: Tensor  # orthonormal directions, largest variance first, each with its largest entry positive, (2, S)
+    shares: Tensor  # share of all variance along each, (2,)
 
     @classmethod
     def fit(cls, points: Tensor) -> "Plane":
         """The plane of two or more points, (M, S)."""
         origin = points.mean(0)
         _, lengths, directions = torch.linalg.svd(points - origin, full_matrices=False)
-        axes = directions[:2]
+        axes, variances = directions[:2], lengths.square()
         largest = axes.gather(1, axes.abs().argmax(1, keepdim=True))
-        variances = lengths.square()
         return cls(origin, axes * largest.sign(), variances[:2] / variances.sum())
 
     def project(self, points: Tensor) -> Tensor:

@@ -1,32 +1,34 @@
-"""Local Lyapunov exponents of imagination: how fast futures part that begin with nearly the same state (Sec. IV-F).
+"""Local Lyapunov exponents of imagination: how fast futures part that begin with nearly the same state.
 
 Over few steps a result depends on the perturbation to start from. This is the one that grows most over just these
 steps: the exponent is the logarithm of the largest singular value of the whole stretch's Jacobian (Abarbanel, Brown and
-Kennel 1991, J. Nonlinear Sci. 1, 175-199). That is never built: Jacobians push a frame of tangent vectors along the
-trajectory, their transposes pull it back, and it is re-orthonormalised at every step (after Benettin et al. 1980,
-Meccanica 15, 9-30).
+Kennel 1991, J. Nonlinear Sci. 1, 175-199). UF-RNN, Sec. IV-F and Fig. 6.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
-from torch.func import jvp, vjp
+from torch.func import jacfwd, vmap
 
 from ..networks import SHLSTM, HiddenState
+from .picture import picture
 
 Map = Callable[[Tensor], Tensor]
-"""One step of a dynamical system: a differentiable function of states (M, S), each row by itself."""
-NUM_VECTORS = 3
-"""Vectors of a frame: one would do, more turn faster towards the one that grows most."""
+"""One step of a dynamical system: a differentiable function of a state (S,)."""
+Curves = Mapping[str, Sequence[np.ndarray]]
+"""For each model its largest local exponent in 1/step at each step of each demonstration, (L,) each."""
+STYLES = (("#cc3311", "-"), ("#0077bb", "--"), ("#555555", "-."), ("#009988", ":"), ("#ee7733", "-"), ("#aa3377", "--"))
 
 
 def exponents_over_time(network: SHLSTM, states: Sequence[HiddenState], num_steps: int) -> list[np.ndarray]:
-    """Largest local Lyapunov exponent of the imagined future at each moment of some episodes.
+    """Largest local exponent of the imagined future at each moment of some episodes, in 1/step, (L,) each.
 
     From each state that the model had, (L, hidden size) each, the closed loop runs for `num_steps`, as in foresight but
-    without noise. Returns the exponents of each episode in 1/step, (L,).
+    without noise.
     """
     step = closed_loop(network)
     return [local_lyapunov_exponent(step, flatten(of_episode), num_steps).cpu().numpy() for of_episode in states]
@@ -48,44 +50,51 @@ def flatten(state: HiddenState) -> Tensor:
 
 
 @torch.no_grad()
-def local_lyapunov_exponent(step: Map, start: Tensor, num_steps: int, num_sweeps: int = 4) -> Tensor:
-    """How fast the perturbation grows that grows most over `num_steps`, in 1/step: (M, S) -> (M,).
+def local_lyapunov_exponent(step: Map, start: Tensor, num_steps: int) -> Tensor:
+    """How fast the perturbation grows that grows most over `num_steps`, in 1/step: (M, S) -> (M,)."""
 
-    Each sweep there and back (subspace iteration) brings the result, which is too small at first, closer.
-    """
-    frame = _random_frame(start, min(NUM_VECTORS, start.shape[-1]))
-    for sweep in range(num_sweeps + 1):
-        state, states = start, []
-        stretch = torch.eye(frame.shape[-1]).to(start)  # the Jacobian of the steps so far within the frames
+    def ahead(state: Tensor) -> Tensor:
         for _ in range(num_steps):
-            states.append(state)
-            state, tangents = _push(step, state, frame)
-            frame, lengths = torch.linalg.qr(tangents)
-            stretch = lengths @ stretch
-        if sweep < num_sweeps:
-            for state in reversed(states):
-                frame = torch.linalg.qr(_pull(step, state, frame)).Q
-    return torch.linalg.svdvals(stretch)[:, 0].log() / num_steps
+            state = step(state)
+        return state
+
+    jacobians = vmap(jacfwd(ahead), chunk_size=64)(start)  # (M, S, S)
+    return torch.linalg.svdvals(jacobians)[:, 0].log() / num_steps
 
 
-def _random_frame(start: Tensor, num_vectors: int) -> Tensor:
-    """Orthonormal vectors (M, S, K) in random directions, always the same."""
-    generator = torch.Generator().manual_seed(0)
-    return torch.linalg.qr(torch.randn(*start.shape, num_vectors, dtype=start.dtype, generator=generator).to(start)).Q
+def draw(curves: Curves, phases: Mapping[str, Sequence[int]], num_steps: int, path: Path) -> None:
+    """Draws mean and standard deviation over the demonstrations for each model and writes them to `path`.
+
+    `phases` has the steps at which phases of the task begin in the demonstrations, and may be empty; `num_steps` is the
+    number of imagined steps.
+    """
+    with picture(path, 7, 3) as figure:
+        axes = figure.subplots()
+        for name, starts in phases.items():
+            axes.axvspan(min(starts) - 0.5, max(starts) + 0.5, color="#dddddd", linewidth=0, zorder=0)
+            axes.text(float(np.mean(starts)), 1.02, name, transform=axes.get_xaxis_transform(), ha="center", fontsize=7)
+        axes.axhline(0, color="black", linewidth=0.6)
+        for number, (label, exponents) in enumerate(curves.items()):
+            color, line = STYLES[number % len(STYLES)]
+            mean, deviation = statistics(exponents)
+            axes.fill_between(mean.index, mean - deviation, mean + deviation, color=color, alpha=0.2, linewidth=0)
+            axes.plot(mean, color=color, linestyle=line, linewidth=1.5, label=label)
+        axes.set(xlabel="step", ylabel=f"largest Lyapunov exponent\nover {num_steps} imagined steps (1/step)")
+        axes.margins(x=0.01)
+        axes.legend(frameon=False)
 
 
-def _push(step: Map, state: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
-    """The next states (M, S), and tangent vectors (M, S, K) carried there by the Jacobians."""
-    states, tangents = jvp(step, (_of_each_vector(state, frame),), (frame.mT.flatten(0, 1),))  # type: ignore[misc]
-    return states[:: frame.shape[-1]], tangents.unflatten(0, (len(state), -1)).mT
+def statistics(exponents: Sequence[np.ndarray]) -> tuple[pd.Series, pd.Series]:
+    """Mean and standard deviation over demonstrations of any length, by step."""
+    over_time = pd.DataFrame([*exponents])  # missing where a demonstration is over
+    return over_time.mean(), over_time.std(ddof=0)
 
 
-def _pull(step: Map, state: Tensor, frame: Tensor) -> Tensor:
-    """Vectors (M, S, K) at the next states carried back by the transposed Jacobians."""
-    (vectors,) = vjp(step, _of_each_vector(state, frame))[1](frame.mT.flatten(0, 1))
-    return vectors.unflatten(0, (len(state), -1)).mT
-
-
-def _of_each_vector(state: Tensor, frame: Tensor) -> Tensor:
-    """States (M, S) once for each vector of their frames: (M * K, S)."""
-    return state.repeat_interleave(frame.shape[-1], dim=0)
+def to_table(curves: Curves) -> pd.DataFrame:
+    """The numbers: one row a step of a demonstration."""
+    demonstrations = {
+        (label, number): pd.Series(values, name="exponent")
+        for label, exponents in curves.items()
+        for number, values in enumerate(exponents)
+    }
+    return pd.concat(demonstrations, names=("model", "demonstration", "step")).reset_index()

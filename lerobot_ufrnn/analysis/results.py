@@ -28,23 +28,12 @@ WHAT_INTERVALS_ARE_OVER = (
 
 
 def count_by_door(trials: Sequence[Trial]) -> pd.DataFrame:
-    """Counts the trials of one evaluation.
+    """Counts the trials of one evaluation: a row for each kind of door, in order of appearance, and `all`.
 
-    Args:
-        trials (`Sequence[Trial]`):
-            Finished trials.
-
-    Returns:
-        `pd.DataFrame`: a row for each kind of door, in order of appearance, and `all`. Columns:
-            - `trials`; `opened_150`, `opened_300`: opened within 150 and 300 steps (15 and 30 s)
-            - `first_try`: opened with no wrong direction tried before
-            - `first_try_wrong`: first direction was wrong; `recovered`: of those, opened within 300 steps
-            - `untried`: the unlatched door was never loaded in any direction
-            - `held`: somebody held the door once it had begun to open; of those `opened_after_hold` within 300 steps,
-              and `tried_another_way` meanwhile
-
-    Raises:
-        ValueError: If there are no trials.
+    Columns are `trials`; `opened_150`, `opened_300`: opened within 150 and 300 steps (15 and 30 s); `first_try`: opened
+    with no wrong direction tried before; `first_try_wrong`: first direction was wrong; `recovered`: of those, opened
+    within 300 steps; `untried`: the unlatched door was never loaded in any direction; `held`: somebody held the door
+    once it had begun to open; of those `opened_after_hold` within 300 steps, and `tried_another_way` meanwhile.
     """
     if not trials:
         raise ValueError("There are no trials to count; run lerobot-eval with --env.trial_log=<file> first.")

@@ -22,55 +22,32 @@ class Attempt(NamedTuple):
 
 
 class Imagination(NamedTuple):
-    """The futures that were imagined at one step of a trial.
-
-    Attributes:
-        step (`int`): the step.
-        ahead (`int`): of how many steps later the first imagined prediction is.
-        futures (`Prediction`): what each of N candidates imagined, (T, N, ...).
-        chosen (`int`): which was kept.
-        refuted (`np.ndarray`, *optional*): likeness of each to failed tries, (N,); with recall.
-    """
+    """The futures that were imagined at one step of a trial."""
 
     step: int
-    ahead: int
-    futures: Prediction
-    chosen: int
-    refuted: np.ndarray | None = None
+    ahead: int  # of how many steps later the first imagined prediction is
+    futures: Prediction  # what each of N candidates imagined, (T, N, ...)
+    chosen: int  # which was kept
+    refuted: np.ndarray | None = None  # likeness of each to failed tries, (N,); with recall
 
 
 @dataclass
 class TrialHistory:
-    """One trial, step by step.
-
-    Attributes:
-        door_kind (`str`): kind of the door.
-        joint_names (`tuple[str, ...]`): names of the joints, gripper included.
-        images (`list[np.ndarray]`): first camera at each step, uint8 (height, width, 3).
-        joints (`list[np.ndarray]`): measured joints at each step, (D_j,).
-        variances (`list[np.ndarray]`): mean predicted variance of joints and image features after each step, (2,).
-        states (`list[HiddenState]`): hidden state after each step, (1, hidden size) each.
-        imaginations (`list[Imagination]`): what was imagined: with recall when surprised, with foresight alone at each
-            step, otherwise never.
-        returns (`list[int]`): steps at which recall was surprised, or found a try blocked, and went back.
-        attempts (`list[Attempt]`): directions tried, also while the door was held, in order.
-        held (`list[int]`): steps at which somebody held the door.
-        success (`bool`): whether the door was opened, which ends the trial.
-        film (`list[np.ndarray]`): the scene before the first step and after each, if it was to be filmed.
-    """
+    """One trial, step by step."""
 
     door_kind: str
-    joint_names: tuple[str, ...]
-    images: list[np.ndarray] = field(default_factory=list)
-    joints: list[np.ndarray] = field(default_factory=list)
-    variances: list[np.ndarray] = field(default_factory=list)
-    states: list[HiddenState] = field(default_factory=list)
+    joint_names: tuple[str, ...]  # gripper included
+    images: list[np.ndarray] = field(default_factory=list)  # first camera at each step, uint8 (height, width, 3)
+    joints: list[np.ndarray] = field(default_factory=list)  # measured at each step, (D_j,)
+    variances: list[np.ndarray] = field(default_factory=list)  # mean one of joints and features after each step, (2,)
+    states: list[HiddenState] = field(default_factory=list)  # after each step, (1, hidden size) each
+    # With recall when surprised, with foresight alone at each step, otherwise never.
     imaginations: list[Imagination] = field(default_factory=list)
-    returns: list[int] = field(default_factory=list)
-    attempts: list[Attempt] = field(default_factory=list)
-    held: list[int] = field(default_factory=list)
-    success: bool = False
-    film: list[np.ndarray] = field(default_factory=list)
+    returns: list[int] = field(default_factory=list)  # steps at which recall went back: surprised, or a try was blocked
+    attempts: list[Attempt] = field(default_factory=list)  # also while the door was held, in order
+    held: list[int] = field(default_factory=list)  # steps at which somebody held the door
+    success: bool = False  # whether the door was opened, which ends the trial
+    film: list[np.ndarray] = field(default_factory=list)  # before the first step and after each, if it was to be filmed
 
     @property
     def first_try(self) -> int | None:
@@ -81,6 +58,12 @@ class TrialHistory:
     def recovered(self) -> bool:
         """`bool`: whether the door was opened although the first direction tried was wrong."""
         return self.success and bool(self.attempts) and self.attempts[0].direction != self.door_kind
+
+    @property
+    def outcome(self) -> tuple[str, str]:
+        """`tuple[str, str]`: what was tried, and whether the door was opened, in words."""
+        tried = ", ".join(direction for _, direction in self.attempts) or "nothing"
+        return tried, "opened" if self.success else "not opened"
 
 
 def run_trial(policy: UFRNNPolicy, env: gym.Env, seed: int, film: bool = False) -> TrialHistory:

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from .colors import DOOR_COLORS
+from .picture import DOOR_COLORS
 from .trial import TrialHistory
 
 FRAMES_PER_SECOND = 10
 SECONDS_AT_END = 3.0
+NUM_COLORS = 128
 BAR_HEIGHT, FONT_SIZE = 58, 16
 WHITE, ALARM = "#ffffff", "#ff7777"
 
@@ -49,16 +50,11 @@ def annotate(history: TrialHistory) -> list[Image.Image]:
     return pictures
 
 
-def write_gif(pictures: Sequence[Image.Image], path: Path, every: int = 1, num_colors: int = 128) -> None:
-    """Writes an animation that rests at its end, then begins again.
-
-    `every` keeps only each so-many-th picture, and the last: so many times as fast. All pictures share `num_colors`, so
-    that what stands still takes no space.
-    """
-    kept = [*pictures[:-1:every], pictures[-1]]
-    sample = np.concatenate([np.asarray(picture) for picture in kept[:: -(-len(kept) // 12)]])
-    palette = Image.fromarray(sample).quantize(num_colors)
-    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in kept]
-    milliseconds = [1000 // FRAMES_PER_SECOND] * (len(kept) - 1) + [round(1000 * SECONDS_AT_END)]
+def write_gif(pictures: Sequence[Image.Image], path: Path) -> None:
+    """Writes an animation that rests at its end, then begins again."""
+    sample = np.concatenate([np.asarray(picture) for picture in pictures[:: -(-len(pictures) // 12)]])
+    palette = Image.fromarray(sample).quantize(NUM_COLORS)  # one for all, so that what stands still takes no space
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    milliseconds = [1000 // FRAMES_PER_SECOND] * (len(pictures) - 1) + [round(1000 * SECONDS_AT_END)]
     path.parent.mkdir(parents=True, exist_ok=True)
     indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=milliseconds, loop=0)

@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import get_type_hints
 
-from draccus.utils import ParsingError
+import draccus
+from draccus.utils import DecodingError, ParsingError
 
 # Nothing here imports LeRobot, PyTorch or MuJoCo: `ufrnn --help` answers at once, and a command that only starts others
 # leaves their memory to them.
-from .flags import parse_flags
-
 COMMANDS = {
     "demo": "record, train, evaluate and draw: the whole path with one command",
     "record": "record demonstrations of the scripted expert into a LeRobotDataset",
@@ -22,14 +21,13 @@ COMMANDS = {
     "report": "put the tables, pictures and videos of a folder into one page",
 }
 
-USAGE = "usage: ufrnn COMMAND [--flag=value ...]\n\n" + "".join(
-    f"  {name:<10} {summary}\n" for name, summary in COMMANDS.items()
-)
-USAGE += (
-    "\n`ufrnn COMMAND --help` explains the flags of a command. Training and evaluation are LeRobot's own commands:\n"
-    "  lerobot-train --policy.type=ufrnn --dataset.repo_id=...\n"
-    "  lerobot-eval --policy.path=... --env.type=door --env.task=all\n"
-)
+USAGE = f"""usage: ufrnn COMMAND [--flag=value ...]
+
+{"".join(f"  {name:<10} {summary}\n" for name, summary in COMMANDS.items())}
+`ufrnn COMMAND --help` explains the flags of a command. Training and evaluation are LeRobot's own commands:
+  lerobot-train --policy.type=ufrnn --dataset.repo_id=...
+  lerobot-eval --policy.path=... --env.type=door --env.task=all
+"""
 
 
 def with_this_python(name: str) -> list[str]:
@@ -38,15 +36,24 @@ def with_this_python(name: str) -> list[str]:
     return [sys.executable, "-m", module]
 
 
+def parse_flags[Config](config_class: type[Config], arguments: list[str], prog: str) -> Config:
+    """Builds a dataclass from flags such as `--seed=3`; the string below a field explains it in the help of `prog`.
+
+    Raises:
+        ValueError: If a value is of the wrong type or out of range; the message is the dataclass's own.
+    """
+    try:
+        return draccus.parse(config_class, args=arguments, prog=prog)
+    except DecodingError as error:  # a value of the wrong type: draccus names the flag
+        raise ValueError(str(error)) from error
+    except ParsingError as error:  # a value out of range: the dataclass says what is allowed, draccus does not
+        raise ValueError(str(error.__cause__ or error)) from error
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one subcommand: the function `run` of its module, with the configuration that `run` takes.
 
-    Args:
-        arguments (`Sequence[str]`, *optional*):
-            Command line without the program's name; `sys.argv[1:]` when not given.
-
-    Returns:
-        `int`: exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted.
+    Without `arguments` those of the command line. Exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted.
     """
     name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):

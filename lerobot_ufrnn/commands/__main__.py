@@ -1,7 +1,5 @@
 """`python -m lerobot_ufrnn.commands` is `ufrnn`."""
 
-import sys
-
 from . import main
 
-sys.exit(main())
+raise SystemExit(main())

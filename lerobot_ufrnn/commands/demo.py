@@ -38,46 +38,21 @@ class DemoConfig:
     expects to be wrong too often to be surprised; `configs/ufrnn.yaml` takes 9000."""
     batch_size: int = 5
     """Episodes per update."""
-    save_freq: int = 100
-    """Updates between checkpoints; an interrupted training goes on from the last one."""
     trials_per_kind: int = 10
     """Evaluation trials for each kind of door."""
     door_offset: float = 0.0
     """Half-width in metres of the range of the door's lateral shift, in demonstrations and trials; 0 to 0.05."""
     seed: int = 0
     """Seed of demonstrations and training. Trials use seeds from 5000 on, which no demonstration has."""
-    device: str = "cpu"
-    """Where to train; this network is too small to gain from a GPU."""
 
     def __post_init__(self) -> None:
         check_choice(self, "exploration", EXPLORATIONS)
         check_range(self, "episodes_per_kind", "autoencoder_steps", "recurrent_steps", low=1)
-        check_range(self, "batch_size", "save_freq", "trials_per_kind", low=1)
-
-    @property
-    def dataset_dir(self) -> Path:
-        """Folder of the demonstrations."""
-        return self.output_dir / "dataset"
-
-    @property
-    def train_dir(self) -> Path:
-        """Folder of training."""
-        return self.output_dir / "train"
-
-    @property
-    def eval_dir(self) -> Path:
-        """Folder of evaluation."""
-        return self.output_dir / "eval"
-
-    @property
-    def last_checkpoint(self) -> Path:
-        """The newest trained policy."""
-        return self.train_dir / LAST_CHECKPOINT
-
-    @property
-    def steps(self) -> int:
-        """All training updates."""
-        return self.autoencoder_steps + self.recurrent_steps
+        check_range(self, "batch_size", "trials_per_kind", low=1)
+        self.dataset_dir, self.train_dir, self.eval_dir = (
+            self.output_dir / name for name in ("dataset", "train", "eval")
+        )
+        self.last_checkpoint = self.train_dir / LAST_CHECKPOINT
 
 
 def run(config: DemoConfig) -> None:
@@ -102,8 +77,7 @@ def run(config: DemoConfig) -> None:
 def record(config: DemoConfig) -> None:
     """Records the demonstrations that are still missing."""
     start(
-        "ufrnn",
-        "record",
+        "ufrnn record",
         f"--repo_id={REPO_ID}",
         f"--root={config.dataset_dir}",
         f"--episodes_per_kind={config.episodes_per_kind}",
@@ -115,7 +89,9 @@ def record(config: DemoConfig) -> None:
 
 def train(config: DemoConfig) -> None:
     """Trains, or goes on from the last checkpoint."""
-    if trained_steps(config) >= config.steps:
+    num_steps = config.autoencoder_steps + config.recurrent_steps
+    step_file = config.last_checkpoint.parent / "training_state" / "training_step.json"
+    if step_file.exists() and json.loads(step_file.read_text())["step"] >= num_steps:
         print("already trained")
         return
     flags = [f"--config_path={config.last_checkpoint / 'train_config.json'}", "--resume=true"]
@@ -126,18 +102,18 @@ def train(config: DemoConfig) -> None:
             "--policy.type=ufrnn",
             f"--policy.exploration={config.exploration}",
             f"--policy.autoencoder.steps={config.autoencoder_steps}",
-            f"--policy.device={config.device}",
+            "--policy.device=cpu",  # the network is too small to gain from a GPU
             f"--dataset.repo_id={REPO_ID}",
             f"--dataset.root={config.dataset_dir}",
             "--dataset.video_backend=pyav",
             f"--output_dir={config.train_dir}",
             f"--batch_size={config.batch_size}",
-            f"--save_freq={config.save_freq}",
+            "--save_freq=100",
             "--log_freq=50",
             "--num_workers=0",
             f"--seed={config.seed}",
         ]
-    start("lerobot-train", *flags, f"--steps={config.steps}")
+    start("lerobot-train", *flags, f"--steps={num_steps}")
 
 
 def evaluate(config: DemoConfig) -> None:
@@ -149,7 +125,7 @@ def evaluate(config: DemoConfig) -> None:
         start(
             "lerobot-eval",
             f"--policy.path={config.last_checkpoint}",
-            f"--policy.device={config.device}",
+            "--policy.device=cpu",
             "--env.type=door",
             "--env.task=all",
             f"--env.door_offset={config.door_offset}",
@@ -161,8 +137,7 @@ def evaluate(config: DemoConfig) -> None:
             f"--seed={TRIAL_SEED}",
         )
     start(
-        "ufrnn",
-        "results",
+        "ufrnn results",
         f"--trial_log={trial_log}",
         f"--trials_per_kind={config.trials_per_kind}",
         f"--output_dir={config.output_dir}",
@@ -174,8 +149,7 @@ def draw(config: DemoConfig) -> None:
     if config.exploration == "foresight":
         try:
             start(
-                "ufrnn",
-                "foresight",
+                "ufrnn foresight",
                 f"--policy_path={config.last_checkpoint}",
                 f"--output={config.output_dir / 'foresight.png'}",
                 f"--door_offset={config.door_offset}",
@@ -200,21 +174,11 @@ def keep_success_videos(config: DemoConfig) -> None:
     print(f"{len(list(videos.iterdir()))} videos of opened doors")
 
 
-def trained_steps(config: DemoConfig) -> int:
-    """Updates that the last checkpoint has; 0 without one."""
-    step_file = config.last_checkpoint.parent / "training_state" / "training_step.json"
-    return json.loads(step_file.read_text())["step"] if step_file.exists() else 0
-
-
-def start(name: str, *flags: str) -> None:
-    """Runs a console command of LeRobot or of ours with this interpreter, to its end.
-
-    Raises:
-        RuntimeError: If it fails.
-        KeyboardInterrupt: If it was interrupted.
-    """
-    print("$ " + shlex.join([name, *flags]), flush=True)
-    status = subprocess.run([*with_this_python(name), *flags], check=False).returncode
+def start(command: str, *flags: str) -> None:
+    """Runs a console command of LeRobot or of ours with this interpreter, to its end; an interruption is passed on."""
+    name, *words = [*command.split(), *flags]
+    print("$ " + shlex.join([name, *words]), flush=True)
+    status = subprocess.run([*with_this_python(name), *words], check=False).returncode
     if status in (-2, 130):
         raise KeyboardInterrupt
     if status != 0:

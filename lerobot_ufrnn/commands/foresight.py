@@ -20,11 +20,7 @@ class ForesightPictureConfig(DoorTrialConfig):
 
 
 def run(config: ForesightPictureConfig) -> None:
-    """Runs the trial and writes the picture.
-
-    Raises:
-        ValueError: If the policy is of another type or runs without foresight, or imagined nothing.
-    """
+    """Runs the trial and writes the picture."""
     policy = load_policy(config.policy_path)
     if policy.config.exploration != "foresight":
         raise ValueError(

@@ -3,9 +3,10 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pandas as pd
 from lerobot.utils.random_utils import set_seed
 
-from ..analysis.hidden_picture import HiddenPaths, draw, to_table
+from ..analysis.hidden_picture import HiddenPaths, draw
 from ..analysis.hidden_states import read_demonstrations, states_along
 from .policies import DoorTrialConfig, load_policies, read_provenance, run_door_trial
 
@@ -32,15 +33,16 @@ class HiddenConfig(DoorTrialConfig):
 def run(config: HiddenConfig) -> None:
     """Writes the picture and the table."""
     provenance = read_provenance(config.dataset_dir)
-    models = []
+    models = {}
     for label, policy in load_policies(config.policy_paths, config.labels).items():
         demonstrations = read_demonstrations(policy, config.dataset_dir)
         kinds = [episode["kind"] for episode in provenance.episodes] if provenance else ["any"] * len(demonstrations)
         set_seed(config.seed)
         states = states_along(policy, demonstrations)
         history = run_door_trial(policy, config, config.kind, hold_seconds=config.hold_seconds)
-        models.append(HiddenPaths.of(label, kinds, states, history))
+        models[label] = HiddenPaths.of(kinds, states, history)
     draw(models, config.output)
-    table = config.output.with_suffix(".csv")
-    to_table(models).to_csv(table, index=False, float_format="%.5f")
-    print(f"Hidden states: {config.output}, {table}")
+    numbers = config.output.with_suffix(".csv")
+    table = pd.concat({label: model.table for label, model in models.items()}, names=["model", None])
+    table.reset_index(level="model").to_csv(numbers, index=False, float_format="%.5f")
+    print(f"Hidden states: {config.output}, {numbers}")

@@ -1,5 +1,6 @@
 """`ufrnn lyapunov`: draw how chaotic the imagined futures are along the demonstrations, model by model."""
 
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,8 +14,7 @@ from env_door.expert import DoorExpert
 from env_door.provenance import Provenance
 
 from ..analysis.hidden_states import read_demonstrations, states_along
-from ..analysis.lyapunov import exponents_over_time
-from ..analysis.lyapunov_picture import draw, to_table
+from ..analysis.lyapunov import draw, exponents_over_time, to_table
 from .policies import load_policies, read_provenance
 
 PHASES = ("grasp", "twist", "open")
@@ -34,12 +34,12 @@ class LyapunovConfig:
     labels: list[str] = field(default_factory=list)
     """Names of the policies; those of the paper by default."""
     horizon: int = 10
-    """Number T of imagined steps over which perturbations grow."""
+    """Number T of imagined steps over which perturbations grow, 1 to 100."""
     seed: int = 2000
     """Seed of exploration noise."""
 
     def __post_init__(self) -> None:
-        check_range(self, "horizon", low=1)
+        check_range(self, "horizon", low=1, high=100)
 
 
 def run(config: LyapunovConfig) -> None:
@@ -59,8 +59,7 @@ def run(config: LyapunovConfig) -> None:
 def phase_starts(provenance: Provenance) -> dict[str, list[int]]:
     """When the phases of the task begin in recorded demonstrations, once a seed: the expert plans them once more."""
     starts: dict[str, list[int]] = {phase: [] for phase in PHASES}
-    env = DoorEnv(arm=provenance.settings["arm"], door_offset=provenance.settings["door_offset"])
-    try:
+    with closing(DoorEnv(arm=provenance.settings["arm"], door_offset=provenance.settings["door_offset"])) as env:
         for seed, kind in {episode["seed"]: episode["kind"] for episode in provenance.episodes}.items():
             env.reset(seed=seed, options={"kind": kind})
             expert = DoorExpert(env, directions=(kind,))
@@ -71,6 +70,4 @@ def phase_starts(provenance: Provenance) -> dict[str, list[int]]:
                 expert.act()
             for phase in PHASES:
                 starts[phase].append(phases.index(phase))
-    finally:
-        env.close()
     return starts

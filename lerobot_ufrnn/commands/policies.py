@@ -44,21 +44,13 @@ def run_door_trial(
     policy: UFRNNPolicy, config: DoorTrialConfig, kind: str, film: bool = False, **options: Any
 ) -> TrialHistory:
     """Runs one trial with a door of this kind; further options are those of [`~env_door.env.DoorEnv`]."""
-    settings: dict[str, Any] = {
-        "max_episode_steps": config.num_steps,
-        "arm": config.arm,
-        "door_offset": config.door_offset,
-    }
-    with closing(gym.make("env_door/Door-v0", kind=kind, **settings, **options)) as env:
+    options |= {"kind": kind, "arm": config.arm, "door_offset": config.door_offset}
+    with closing(gym.make("env_door/Door-v0", max_episode_steps=config.num_steps, **options)) as env:
         return run_trial(policy, env, config.seed, film)
 
 
 def load_policy(path: str) -> UFRNNPolicy:
-    """Loads a `ufrnn` policy with the reference kernel, which keeps what it imagines and needs no compiling.
-
-    Raises:
-        ValueError: If the policy is of another type.
-    """
+    """Loads a `ufrnn` policy with the reference kernel, which keeps what it imagines and needs no compiling."""
     config = PreTrainedConfig.from_pretrained(path)
     if config.type != "ufrnn":
         raise ValueError(f"'{path}' is a policy of type {config.type}; only ufrnn can be looked into.")
@@ -67,16 +59,7 @@ def load_policy(path: str) -> UFRNNPolicy:
 
 
 def load_policies(paths: Sequence[str], labels: Sequence[str]) -> dict[str, UFRNNPolicy]:
-    """Loads policies to compare, by name.
-
-    Args:
-        paths (`Sequence[str]`):
-            Checkpoint folders or Hub repositories.
-        labels (`Sequence[str]`):
-            Their names; when empty, what the paper calls a policy with such exploration.
-
-    Returns:
-        `dict[str, UFRNNPolicy]`: the policies, in order.
+    """Loads policies to compare, by name: its label or, without labels, what the paper calls one that explores like it.
 
     Raises:
         ValueError: If there is no policy, one is of another type, or they cannot be told apart by their names.

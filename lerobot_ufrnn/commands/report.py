@@ -1,9 +1,8 @@
 """`ufrnn report`: the tables, pictures and videos of a folder in one page that needs nothing else."""
 
-import html
-import os
 from base64 import b64encode
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from string import Template
 
@@ -49,6 +48,9 @@ PARTS = {
 }
 """What the page shows, in this order: heading, what one sees, and the command that makes it."""
 
+MEDIA = {".png": ("image/png", b"\x89PNG"), ".gif": ("image/gif", b"GIF8"), ".mp4": ("video/mp4", b"")}
+"""Media type of a file, and how it begins."""
+
 PAGE = Template("""<!doctype html>
 <html lang="en">
 <head>
@@ -76,45 +78,30 @@ class ReportConfig:
     """Puts what other commands left in a folder into one HTML file, and names what is missing."""
 
     folder: Path = Path("outputs/demo")
-    """Folder with `results.csv`, pictures and a folder `videos`, such as that of `ufrnn demo`."""
-    output: Path | None = None
-    """Page to write; `report.html` in that folder when not given."""
+    """Folder with `results.csv`, pictures and a folder `videos`, such as that of `ufrnn demo`; `report.html` is written
+    into it."""
 
 
 def run(config: ReportConfig) -> None:
-    """Writes the page.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-        ValueError: If a file in it is not what its name says.
-    """
+    """Writes the page."""
     if not config.folder.is_dir():
         raise FileNotFoundError(f"--folder: there is no folder '{config.folder}'.")
     parts = [_part(config.folder, name, *texts) for name, texts in PARTS.items()]
     if videos := sorted(config.folder.glob("videos/*.mp4")):
         parts.append("<h2>Videos of opened doors</h2>")
-        parts += [
-            f'<video controls src="{_data("video/mp4", video)}" title="{_text(video.name)}"></video>'
-            for video in videos
-        ]
-    page = PAGE.substitute(folder=_text(config.folder), parts="\n".join(parts))
-    output = config.output or config.folder / "report.html"
-    output.parent.mkdir(parents=True, exist_ok=True)
-    temporary = output.with_name(f".{output.name}.{os.getpid()}")
-    temporary.write_text(page)
-    temporary.replace(output)  # whoever has the last page open keeps it until this one is complete
-    print(f"Report: {output} ({len(page.encode()) / 1e6:.1f} MB)")
+        parts += [f'<video controls src="{_data(video)}" title="{escape(video.name)}"></video>' for video in videos]
+    output = config.folder / "report.html"
+    output.write_text(PAGE.substitute(folder=escape(str(config.folder)), parts="\n".join(parts)))
+    print(f"Report: {output} ({output.stat().st_size / 1e6:.1f} MB)")
 
 
 def _part(folder: Path, name: str, heading: str, text: str, command: str) -> str:
-    path, head = folder / name, f"<h2>{heading}</h2>\n<p>{_text(text)}</p>"
+    path, text = folder / name, escape(text)
     if not path.exists():
-        made_by = _text(command.format(folder=folder))
-        return f"<h2>{heading}</h2>\n<p>There is no {_text(path)}; <code>{made_by}</code> makes it.</p>"
-    if path.suffix == ".csv":
-        return f"{head}\n<div>{_tables(path)}</div>"
-    media_type = {".png": "image/png", ".gif": "image/gif"}[path.suffix]
-    return f'{head}\n<img alt="{_text(text)}" src="{_data(media_type, path)}">'
+        content = f"There is no {escape(str(path))}; <code>{escape(command.format(folder=folder))}</code> makes it."
+        return f"<h2>{heading}</h2>\n<p>{content}</p>"
+    content = f"<div>{_tables(path)}</div>" if path.suffix == ".csv" else f'<img alt="{text}" src="{_data(path)}">'
+    return f"<h2>{heading}</h2>\n<p>{text}</p>\n{content}"
 
 
 def _tables(path: Path) -> str:
@@ -125,14 +112,9 @@ def _tables(path: Path) -> str:
     return "\n".join(table.to_html() for table in tables)
 
 
-def _data(media_type: str, path: Path) -> str:
+def _data(path: Path) -> str:
+    media_type, first_bytes = MEDIA[path.suffix]
     content = path.read_bytes()
-    if not content.startswith(
-        b"\x89PNG" if media_type == "image/png" else b"GIF8" if media_type == "image/gif" else b""
-    ):
+    if not content.startswith(first_bytes):
         raise ValueError(f"{path} is no {media_type}: make it anew or remove it.")
     return f"data:{media_type};base64,{b64encode(content).decode()}"
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value))

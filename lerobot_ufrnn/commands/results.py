@@ -29,11 +29,12 @@ class ResultsConfig:
 def run(config: ResultsConfig) -> None:
     """Prints the table, and writes it when asked to."""
     trials = read_trials(config.trial_log)
-    counts = count_by_door(
-        trials if config.trials_per_kind is None else first_of_each_kind(trials, config.trials_per_kind)
-    )
+    if config.trials_per_kind is not None:
+        trials = first_of_each_kind(trials, config.trials_per_kind)
+    counts = count_by_door(trials)
+    text = to_markdown(counts)
     if config.output_dir is not None:
         config.output_dir.mkdir(parents=True, exist_ok=True)
-        (config.output_dir / "results.md").write_text(to_markdown(counts))
+        (config.output_dir / "results.md").write_text(text)
         counts.to_csv(config.output_dir / "results.csv")
-    print(to_markdown(counts), end="")
+    print(text, end="")

@@ -20,27 +20,19 @@ class VideoConfig(DoorTrialConfig):
     """GIF file to write."""
     size: int = 360
     """Width of the picture in pixels, 16 to 768."""
-    speed: int = 1
-    """How many times as fast as it was: so many of its pictures are left out."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, "size", low=16, high=768)
-        check_range(self, "speed", low=1)
 
 
 def run(config: VideoConfig) -> None:
-    """Runs trials until there is one to show, and writes its film.
-
-    Raises:
-        ValueError: If the policy is of another type, or finds out none of the doors.
-    """
+    """Runs trials until there is one to show, and writes its film."""
     policy = load_policy(config.policy_path)
     for kind in KINDS if config.kind == "any" else (config.kind,):
         history = run_door_trial(policy, config, kind, film=True, render_size=config.size)
-        tries = ", ".join(direction for _, direction in history.attempts) or "nothing"
-        result = "opened" if history.success else "not opened"
-        print(f"{kind} door: tried {tries}; went back {len(history.returns)} times; {result}", flush=True)
+        tried, result = history.outcome
+        print(f"{kind} door: tried {tried}; went back {len(history.returns)} times; {result}", flush=True)
         if config.kind != "any" or (history.recovered and history.returns):
             break
     else:
@@ -48,5 +40,5 @@ def run(config: VideoConfig) -> None:
             "In no trial was the first try wrong, the policy surprised and the door opened at last: give another "
             "--seed, or a --kind to film whatever happens."
         )
-    write_gif(annotate(history), config.output, config.speed)
+    write_gif(annotate(history), config.output)
     print(f"Film: {config.output} ({config.output.stat().st_size / 1e6:.1f} MB)")

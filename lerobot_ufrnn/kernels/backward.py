@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from .activations import tanh
 from .compile import compiled
+from .forward import tanh
 from .layout import Gradients, Sizes, Steps
 
 
@@ -47,24 +47,11 @@ def pass_back(
     first: int,
     last: int,
 ) -> None:
-    """Back-propagation through time along `pass_through`; noise and selection carry no gradient.
+    """Fills `gradients` of episodes `first` to `last - 1` along what `pass_through` left; noise and choice carry none.
 
-    Args:
-        weights (`Gradients`):
-            From the gradients of the gates to that of what they read: for the shared cell the whole hidden state
-            (4 H_shared, H), for the lower ones `h_shared` (4 hidden size, H_shared).
-        sizes (`Sizes`):
-            Sizes of the network.
-        steps (`Steps`):
-            What `pass_through` left behind.
-        first_cell (`np.ndarray`):
-            Cell states before the first step, (B, H).
-        grad_kept (`np.ndarray`):
-            Gradient of the loss by `steps.hidden`, (L, B, H).
-        gradients (`Gradients`):
-            Where to write.
-        first (`int`), last (`int`):
-            Which episodes.
+    `weights` lead from the gradients of the gates to that of what they read: for the shared cell the whole hidden state
+    (4 H_shared, H), for the lower ones `h_shared` (4 hidden size, H_shared). `first_cell` are the cell states before
+    the first step, (B, H); `grad_kept` is the gradient of the loss by `steps.hidden`, (L, B, H).
     """
     joint, image, shared = sizes.joint, sizes.image, sizes.shared
     grad_hidden = np.empty(first_cell[first:last].shape, grad_kept.dtype)

@@ -19,23 +19,12 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compiles a function with Numba for the processor it runs on, and keeps the machine code on disk.
 
     The first call ever takes some seconds, later processes load the result. Where no folder can be written, each
-    process compiles anew.
-
-    Args:
-        function (`Callable`):
-            Function on NumPy arrays, in Numba's subset of Python.
-
-    Returns:
-        `Callable`: the compiled function; it releases the GIL.
+    process compiles anew. Compiled functions release the GIL.
     """
-    options: dict[str, Any] = {"fastmath": FAST_MATH, "error_model": "numpy", "nogil": True}
-    folder = _cache_folder()
-    if folder is None:
-        return numba.njit(**options)(function)
-    before = settings.CACHE_DIR
-    settings.CACHE_DIR = folder
+    before, folder = settings.CACHE_DIR, _cache_folder()
+    settings.CACHE_DIR = folder or before
     try:
-        return numba.njit(cache=True, **options)(function)
+        return numba.njit(cache=bool(folder), fastmath=FAST_MATH, error_model="numpy", nogil=True)(function)
     finally:
         settings.CACHE_DIR = before
 
@@ -46,9 +35,8 @@ def _cache_folder() -> str | None:
     here = Path(__file__).parent
     code = b"".join(file.read_bytes() for file in sorted(here.glob("*.py")))
     name = f"ufrnn-{hashlib.sha256(code).hexdigest()[:16]}"
-    asked_for = [Path(settings.CACHE_DIR)] if settings.CACHE_DIR else []
-    for base in (*asked_for, here / "__pycache__", Path.home() / ".cache"):
-        folder = base / name
+    for base in filter(None, (settings.CACHE_DIR, here / "__pycache__", Path.home() / ".cache")):
+        folder = Path(base, name)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError:

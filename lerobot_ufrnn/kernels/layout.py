@@ -38,38 +38,26 @@ class Options(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Weights (inputs, gates) and biases (gates) of the cells.
+    """Weights (inputs, gates) and biases (gates) of the cells."""
 
-    Attributes:
-        shared: from `[h_joint | h_image | h_shared]`.
-        joint: from `[joints | h_shared]`.
-        image: from `[features | h_shared]`.
-    """
-
-    shared: Tensor
+    shared: Tensor  # from `[h_joint | h_image | h_shared]`
     shared_bias: Tensor
-    joint: Tensor
+    joint: Tensor  # from `[joints | h_shared]`
     joint_bias: Tensor
-    image: Tensor
+    image: Tensor  # from `[features | h_shared]`
     image_bias: Tensor
 
 
 class Weights(NamedTuple):
-    """Weights as the compiled functions read them.
+    """Weights as the compiled functions read them."""
 
-    Attributes:
-        whole (`np.ndarray`): from a whole hidden state: gates of the shared cell, and the means (D) that it predicts.
-        joint (`np.ndarray`), image (`np.ndarray`): as of `Cells`.
-        spread (`np.ndarray`): from a whole hidden state: unbounded log-variances (D).
-    """
-
-    whole: np.ndarray
+    whole: np.ndarray  # from a whole hidden state: gates of the shared cell, and the means (D) that it predicts
     whole_bias: np.ndarray
-    joint: np.ndarray
+    joint: np.ndarray  # this and the next three as of `Cells`
     joint_bias: np.ndarray
     image: np.ndarray
     image_bias: np.ndarray
-    spread: np.ndarray
+    spread: np.ndarray  # from a whole hidden state: unbounded log-variances (D)
     spread_bias: np.ndarray
 
 
@@ -82,49 +70,30 @@ class Model(NamedTuple):
 
 
 class Episodes(NamedTuple):
-    """What a pass through L steps of B episodes reads, N candidates a step.
+    """What a pass through L steps of B episodes reads, N candidates a step."""
 
-    Attributes:
-        inputs (`np.ndarray`): scaled joints and image features, (L, B, D).
-        noise (`np.ndarray`): standard normal numbers, (L, N, B, H).
-        noise_bounds (`np.ndarray`): `low` and `high` of the `NoiseSchedule`, (2, 2).
-        hidden (`np.ndarray`), cell (`np.ndarray`): states before the first step, (B, H).
-    """
-
-    inputs: np.ndarray
-    noise: np.ndarray
-    noise_bounds: np.ndarray
-    hidden: np.ndarray
+    inputs: np.ndarray  # scaled joints and image features, (L, B, D)
+    noise: np.ndarray  # standard normal numbers, (L, N, B, H)
+    noise_bounds: np.ndarray  # `low` and `high` of the `NoiseSchedule`, (2, 2)
+    hidden: np.ndarray  # state before the first step, (B, H)
     cell: np.ndarray
 
 
 class Steps(NamedTuple):
-    """Everything that a pass leaves behind; filled in place.
+    """Everything that a pass leaves behind; filled in place."""
 
-    Attributes:
-        hidden (`np.ndarray`), cell (`np.ndarray`): state that is kept after each step, (L, B, H).
-        raw_cell (`np.ndarray`): cell state before it was perturbed, (L, B, H).
-        joint_input (`np.ndarray`), image_input (`np.ndarray`): of the lower cells, (L, B, D_j or D_f + H_shared).
-        whole (`np.ndarray`): gates of the shared cell, and predicted means, (L, B, 4 H_shared + D).
-        joint_gates (`np.ndarray`), image_gates (`np.ndarray`): (L, B, 4 hidden size).
-        noise_std (`np.ndarray`): standard deviation of the noise, joints first, (L, B, 2).
-        chosen (`np.ndarray`): kept candidate, (L, B).
-        baseline (`np.ndarray`): uncertainty before foresight, (L, B).
-        final (`np.ndarray`): uncertainty at the horizon, (L, N, B).
-    """
-
-    hidden: np.ndarray
+    hidden: np.ndarray  # state that is kept after each step, (L, B, H)
     cell: np.ndarray
-    raw_cell: np.ndarray
-    joint_input: np.ndarray
+    raw_cell: np.ndarray  # cell state before it was perturbed, (L, B, H)
+    joint_input: np.ndarray  # of the lower cells, (L, B, D_j or D_f + H_shared)
     image_input: np.ndarray
-    whole: np.ndarray
-    joint_gates: np.ndarray
+    whole: np.ndarray  # gates of the shared cell, and predicted means, (L, B, 4 H_shared + D)
+    joint_gates: np.ndarray  # (L, B, 4 hidden size)
     image_gates: np.ndarray
-    noise_std: np.ndarray
-    chosen: np.ndarray
-    baseline: np.ndarray
-    final: np.ndarray
+    noise_std: np.ndarray  # standard deviation of the noise, joints first, (L, B, 2)
+    chosen: np.ndarray  # kept candidate, (L, B)
+    baseline: np.ndarray  # uncertainty before foresight, (L, B)
+    final: np.ndarray  # uncertainty at the horizon, (L, N, B)
 
 
 class Gradients(NamedTuple):

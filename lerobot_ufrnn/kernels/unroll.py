@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor
 from torch.autograd.function import once_differentiable
 
-from ..configuration_ufrnn import ForesightConfig, UFRNNConfig
+from ..configuration_ufrnn import UFRNNConfig
 from ..foresight import UFRNN, ForesightTrace, Memory
 from ..networks import HiddenState, Prediction
 from .backward import pass_back
@@ -45,19 +45,18 @@ class FastUFRNN(UFRNN):
 
     Sequences are independent of each other and share PyTorch's number of threads. With weights on another device,
     weights and inputs visit the CPU for the recurrence: it is so small and so sequential that a GPU would spend its
-    time on starting kernels. Imagined futures are not kept: `ForesightTrace.futures` is `None`.
-
-    Args:
-        config (`UFRNNConfig`):
-            Configuration with its features filled in, of which nothing is [`unsupported`].
+    time on starting kernels. Imagined futures are not kept: `ForesightTrace.futures` is `None`. Nothing of the
+    configuration may be [`unsupported`].
     """
 
     def __init__(self, config: UFRNNConfig):
         super().__init__(config)
-        network, (low, high) = self.network, config.log_variance_range
-        hidden_sizes = (config.joint_hidden_dim, config.image_hidden_dim, config.shared_hidden_dim)
-        self._sizes = Sizes(network.joint_dim, network.feature_dim, *hidden_sizes)
-        self._options = _options(config.foresight, config.exploration, float(low), float(high))
+        network, foresight = self.network, config.foresight
+        self._sizes = Sizes(network.joint_dim, network.feature_dim, *network.state_sizes[::2])
+        explores, selects = config.exploration != "none", config.exploration == "foresight"
+        low, high, least, most = map(float, (*config.log_variance_range, *foresight.noise_range))
+        in_variance = foresight.noise_unit == "variance"
+        self._options = Options(low, high, explores, selects, foresight.horizon, least, most, in_variance)
         self._packed: tuple[tuple[tuple[int, int], ...], Weights] | None = None
         # Compiled code is made or loaded now, so that a robot's first tick does not wait for it.
         inputs = torch.zeros(1, network.joint_dim + network.feature_dim)
@@ -78,7 +77,7 @@ class FastUFRNN(UFRNN):
         model = Model(self._pack_once(), self._sizes, self._options)
         starts = (to_host(values).numpy() for values in _to_rows(state))
         hidden, cell = (np.repeat(start[None], num_steps + 1, axis=0) for start in starts)
-        _share(lambda first, last: imagine(model, hidden, cell, first, last), hidden.shape[1])
+        _share(lambda *share: imagine(model, hidden, cell, *share), hidden.shape[1])
         device = state.h_joint.device
         return self._to_state(torch.from_numpy(hidden).to(device), torch.from_numpy(cell).to(device))
 
@@ -103,18 +102,22 @@ class FastUFRNN(UFRNN):
         hidden, cell = _to_rows(start)
         time_first = to_host(inputs.transpose(0, 1))
         episodes = Episodes(*(to_host(values).numpy() for values in (time_first, noise, bounds, hidden, cell)))
-        if torch.is_grad_enabled():
-            cells = pack_cells(self.network)
-            passage = _Passage(Model(pack_weights(self.network, cells), self._sizes, options), episodes)
-            kept = _Unroll.apply(passage, inputs.transpose(0, 1), *cells)
-        else:
-            passage = _Passage(Model(self._pack_once(), self._sizes, options), episodes)
-            passage.forward()
-            kept = torch.from_numpy(passage.steps.hidden).to(device)
+        cells = pack_cells(self.network) if torch.is_grad_enabled() else None
+        weights = pack_weights(self.network, cells) if cells else self._pack_once()
+        passage = _Passage(Model(weights, self._sizes, options), episodes)
+        kept = _Unroll.apply(passage, inputs.transpose(0, 1), *(cells or ()))
         states = self._to_state(kept, torch.from_numpy(passage.steps.cell).to(device))  # (L, B, hidden size) each
         prediction = self.network.predict(states)
-        last = HiddenState(*(values[-1] for values in states))
-        return prediction, last, _trace(passage.steps, options, device) if options.selects else None
+        if not options.selects:
+            return prediction, states.at(-1), None
+        steps = passage.steps
+        noise_std, chosen, baseline, final = (
+            torch.from_numpy(values).to(device)
+            for values in (steps.noise_std, steps.chosen, steps.baseline, steps.final)
+        )
+        horizon = torch.full_like(final, options.horizon, dtype=torch.int64)
+        trace = ForesightTrace(noise_std, chosen, baseline.unsqueeze(1).expand_as(final), final, horizon, None, None)
+        return prediction, states.at(-1), trace
 
     def _pack_once(self) -> Weights:
         """Packed weights, made anew only when a parameter was changed in place or replaced."""
@@ -138,24 +141,9 @@ class FastUFRNN(UFRNN):
         return {**self.__dict__, "_packed": None}
 
 
-def _options(config: ForesightConfig, exploration: str, low: float, high: float) -> Options:
-    noise_low, noise_high = map(float, config.noise_range)
-    explores, selects = exploration != "none", exploration == "foresight"
-    return Options(low, high, explores, selects, config.horizon, noise_low, noise_high, config.noise_unit == "variance")
-
-
-def _trace(steps: Steps, options: Options, device: torch.device) -> ForesightTrace:
-    noise_std, chosen, baseline, final = (
-        torch.from_numpy(values).to(device) for values in (steps.noise_std, steps.chosen, steps.baseline, steps.final)
-    )
-    horizon = torch.full_like(final, options.horizon, dtype=torch.int64)
-    return ForesightTrace(noise_std, chosen, baseline.unsqueeze(1).expand_as(final), final, horizon, None, None)
-
-
 def _to_rows(state: HiddenState) -> tuple[Tensor, Tensor]:
     """Hidden and cell states, (..., H) each."""
-    hidden = torch.cat((state.h_joint, state.h_image, state.h_shared), dim=-1)
-    return hidden, torch.cat((state.c_joint, state.c_image, state.c_shared), dim=-1)
+    return torch.cat(state[::2], dim=-1), torch.cat(state[1::2], dim=-1)
 
 
 class _Passage:
@@ -184,10 +172,8 @@ class _Passage:
         )
 
     def forward(self) -> None:
-        def some(first: int, last: int) -> None:
-            pass_through(self.model, self.episodes, self.steps, first, last)
-
-        _share(some, self.episodes.inputs.shape[1], self.episodes.noise.shape[1])
+        whole = self.model, self.episodes, self.steps
+        _share(lambda *share: pass_through(*whole, *share), self.steps.hidden.shape[1], self.episodes.noise.shape[1])
 
     def backward(self, grad_kept: np.ndarray) -> Gradients:
         weights, sizes, steps = self.model.weights, self.model.sizes, self.steps
@@ -198,11 +184,8 @@ class _Passage:
         )
         shape = steps.hidden.shape[:2]
         gradients = Gradients(*(np.empty((*shape, weight.shape[0]), weight.dtype) for weight in back))
-
-        def some(first: int, last: int) -> None:
-            pass_back(back, sizes, steps, self.episodes.cell, grad_kept, gradients, first, last)
-
-        _share(some, shape[1])
+        whole = back, sizes, steps, self.episodes.cell, grad_kept, gradients
+        _share(lambda *share: pass_back(*whole, *share), shape[1])
         return gradients
 
 

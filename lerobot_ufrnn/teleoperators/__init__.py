@@ -2,30 +2,17 @@
 
 from typing import TYPE_CHECKING, Any
 
-from .configuration import KeyboardTwistConfig, SpaceMouseTwistConfig, TwistTeleoperatorConfig
-from .device import ArmStateError, DeviceLostError, DeviceState, DeviceUnavailableError, TwistDevice
+from .configuration import KeyboardTwistConfig, SpaceMouseTwistConfig
 
 if TYPE_CHECKING:
-    from .twist_teleoperator import KeyboardTwist, SpaceMouseTwist, TwistTeleoperator
+    from .twist_teleoperator import KeyboardTwist, SpaceMouseTwist
 
-__all__ = [
-    "ArmStateError",
-    "DeviceLostError",
-    "DeviceState",
-    "DeviceUnavailableError",
-    "KeyboardTwist",
-    "KeyboardTwistConfig",
-    "SpaceMouseTwist",
-    "SpaceMouseTwistConfig",
-    "TwistDevice",
-    "TwistTeleoperator",
-    "TwistTeleoperatorConfig",
-]
+__all__ = ["KeyboardTwist", "KeyboardTwistConfig", "SpaceMouseTwist", "SpaceMouseTwistConfig"]
 
 
 def __getattr__(name: str) -> Any:
     # On demand: the plug-in imports the configurations at the start of every command, the teleoperators need MuJoCo.
-    if name in ("KeyboardTwist", "SpaceMouseTwist", "TwistTeleoperator"):
+    if name in ("KeyboardTwist", "SpaceMouseTwist"):
         from . import twist_teleoperator
 
         return getattr(twist_teleoperator, name)

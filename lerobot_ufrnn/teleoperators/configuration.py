@@ -11,11 +11,7 @@ from lerobot_ufrnn.robots.ur5e_robotiq.configuration import UR5eRobotiqConfig, c
 
 @dataclass(kw_only=True)
 class TwistTeleoperatorConfig(TeleoperatorConfig):
-    """What the teleoperators have in common.
-
-    Raises:
-        ParsingError: If a field is out of its range.
-    """
+    """What the teleoperators have in common."""
 
     robot_ip: str
     """Address of the arm's controller, the same as `--robot.ip`. Where the arm is is read there."""

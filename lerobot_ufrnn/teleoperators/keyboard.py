@@ -1,7 +1,6 @@
 """A keyboard as an input device: which keys are held, and what they mean."""
 
 import logging
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,16 +11,14 @@ from .device import CLOSE, OPEN, DeviceLostError, DeviceState, DeviceUnavailable
 
 logger = logging.getLogger(__name__)
 
+# Axis of the twist and direction of each key; none is one that LeRobot's recording listens to (n, r, q, ...).
 AXES = {
     key: (axis, direction)
     for axis, pair in enumerate(("ws", "ad", "ec", "ou", "ik", "jl"))
     for key, direction in zip(pair, (1.0, -1.0), strict=True)
 }
-"""Axis of the twist and direction of each key. None of them is one that LeRobot's recording listens to: n, r, q,
-the arrows and Escape."""
-
 GRIPPER = {"g": CLOSE, "h": OPEN}
-SHIFTS = ("shift", "shift_l", "shift_r")
+SHIFTS = {"shift", "shift_l", "shift_r"}
 
 HELP = (
     "w/s ahead/back, a/d left/right, e/c up/down; u/o roll left/right, i/k tip over/up, j/l turn left/right; "
@@ -41,7 +38,6 @@ class KeyboardDevice(TwistDevice):
     def __init__(self) -> None:
         self._listener: Any = None
         self._held: set[str] = set()
-        self._shifts: set[str] = set()
 
     def open(self) -> None:
         """Starts listening."""
@@ -57,8 +53,10 @@ class KeyboardDevice(TwistDevice):
             )
         from pynput import keyboard
 
-        self._held, self._shifts = set(), set()
-        self._listener = keyboard.Listener(on_press=self._press, on_release=self._release)
+        self._held.clear()
+        self._listener = keyboard.Listener(
+            on_press=lambda key: self._held.add(_name(key)), on_release=lambda key: self._held.discard(_name(key))
+        )
         self._listener.start()
         if not pynput_listener_is_trusted(self._listener):
             self.close()
@@ -72,7 +70,9 @@ class KeyboardDevice(TwistDevice):
         """What the held keys amount to; opposite keys cancel out."""
         if self._listener is None or not self._listener.is_alive():
             raise DeviceLostError("pynput stopped listening to the keyboard: start the command again.")
-        held = self._held.copy() if self._shifts else set()
+        held = self._held.copy()
+        if not held & SHIFTS:
+            return DeviceState()
         twist = np.zeros(6)
         for key in held & set(AXES):
             axis, direction = AXES[key]
@@ -85,14 +85,7 @@ class KeyboardDevice(TwistDevice):
             self._listener.stop()
             self._listener = None
 
-    def _press(self, key: Any) -> None:
-        self._note(key, set.add)
 
-    def _release(self, key: Any) -> None:
-        self._note(key, set.discard)
-
-    def _note(self, key: Any, change: Callable[[set[str], str], None]) -> None:
-        if (name := getattr(key, "name", None)) in SHIFTS:
-            change(self._shifts, str(name))
-        elif character := getattr(key, "char", None):
-            change(self._held, character.lower())
+def _name(key: Any) -> str:
+    """What a key of pynput is called: its character, or "shift_r" and the like."""
+    return (getattr(key, "char", None) or getattr(key, "name", None) or "").lower()

@@ -11,11 +11,8 @@ import numpy as np
 from .configuration import SpaceMouseTwistConfig
 from .device import CLOSE, OPEN, DeviceLostError, DeviceState, DeviceUnavailableError, TwistDevice
 
-POLL_SECONDS = 0.002
-"""Pause between two looks for a report; a deflected cap sends two every 8 ms."""
-
-JOIN_SECONDS = 1.0
-"""How long the thread may take to end."""
+POLL_SECONDS = 0.002  # between two looks for a report; a deflected cap sends two every 8 ms
+JOIN_SECONDS = 1.0  # that the thread may take to end
 
 PERMISSIONS = (
     'a rule such as KERNEL=="hidraw*", ATTRS{idVendor}=="256f", MODE="0660", TAG+="uaccess" in '
@@ -34,32 +31,22 @@ class SpaceMouseDevice(TwistDevice):
     """
 
     def __init__(self, config: SpaceMouseTwistConfig, clock: Callable[[], float] = time.monotonic):
-        self._deadzone = config.deadzone
-        self._stale_after = config.stale_after
+        self._config = config
         self._clock = clock
         self._mouse: Any = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._latest = DeviceState()
-        self._heard = -np.inf
-        self._loss: Exception | None = None
 
     def open(self) -> None:
         """Opens the first SpaceMouse."""
         try:
             import pyspacemouse
-        except ImportError as error:
-            raise DeviceUnavailableError(
-                f"--teleop.type=spacemouse_twist needs pyspacemouse, which cannot be imported ({error}): "
-                "`pip install 'lerobot_policy_ufrnn[spacemouse]'`. --teleop.type=keyboard_twist works without it."
-            ) from error
-        except OSError as error:  # it loads hidapi while it is imported
-            raise DeviceUnavailableError(_library_missing(error)) from error
-        try:
+
             self._mouse = pyspacemouse.open(axis_convention=pyspacemouse.AxisConvention.ROS)
         except Exception as error:
             raise DeviceUnavailableError(_explain(error)) from error
-        self._latest, self._heard, self._loss = DeviceState(), -np.inf, None
+        self._latest, self._heard = DeviceState(), -np.inf
+        self._loss: Exception | None = None
         self._stop.clear()
         self._thread = threading.Thread(target=self._follow, name="spacemouse", daemon=True)
         self._thread.start()
@@ -71,7 +58,7 @@ class SpaceMouseDevice(TwistDevice):
                 f"The SpaceMouse is gone ({self._loss}): plug it in (or charge it) and start the command again."
             ) from self._loss
         state = self._latest
-        if self._clock() - self._heard > self._stale_after:
+        if self._clock() - self._heard > self._config.stale_after:
             # Buttons are reported only when they change, so their silence means nothing.
             return DeviceState(buttons=state.buttons)
         return state
@@ -104,28 +91,26 @@ class SpaceMouseDevice(TwistDevice):
 
     def _translate(self, report: Any) -> DeviceState:
         raw = np.array([report.x, report.y, report.z, report.roll, report.pitch, report.yaw], dtype=np.float64)
-        beyond = np.maximum(np.abs(raw) - self._deadzone, 0.0) / (1.0 - self._deadzone)
-        twist = np.sign(raw) * np.minimum(beyond, 1.0)
-        buttons = list(report.buttons)
-        held = {CLOSE} if buttons[:1] == [1] else set()
-        held |= {OPEN} if buttons[1:2] == [1] else set()
+        deadzone = self._config.deadzone
+        twist = np.sign(raw) * np.clip((np.abs(raw) - deadzone) / (1.0 - deadzone), 0.0, 1.0)
+        held = (name for name, is_held in zip((CLOSE, OPEN), report.buttons, strict=False) if is_held == 1)
         return DeviceState(twist, frozenset(held))
 
 
-def _library_missing(error: Exception) -> str:
-    return (
-        f"pyspacemouse does not find the library hidapi ({error}): `sudo apt install libhidapi-hidraw0` on Debian and "
-        "Ubuntu, `brew install hidapi` on macOS."
-    )
-
-
 def _explain(error: Exception) -> str:
-    message = str(error)
-    if "HID API" in message:
-        return _library_missing(error)
-    if "Failed to open" in message:
-        return f"The SpaceMouse may not be opened by this user ({message}): add {PERMISSIONS}."
+    if isinstance(error, ImportError):
+        return (
+            f"--teleop.type=spacemouse_twist needs pyspacemouse, which cannot be imported ({error}): "
+            "`pip install 'lerobot_policy_ufrnn[spacemouse]'`. --teleop.type=keyboard_twist works without it."
+        )
+    if "Failed to open" in str(error):
+        return f"The SpaceMouse may not be opened by this user ({error}): add {PERMISSIONS}."
+    if "HID API" in str(error) or isinstance(error, OSError):  # which pyspacemouse raises where it loads the library
+        return (
+            f"pyspacemouse does not find the library hidapi ({error}): `sudo apt install libhidapi-hidraw0` on Debian "
+            "and Ubuntu, `brew install hidapi` on macOS."
+        )
     return (
-        f"No SpaceMouse can be opened ({message}): plug one in, quit 3Dconnexion's own driver, and if it is not listed "
+        f"No SpaceMouse can be opened ({error}): plug one in, quit 3Dconnexion's own driver, and if it is not listed "
         f"by `pyspacemouse --list-connected` although it is there, add {PERMISSIONS}."
     )

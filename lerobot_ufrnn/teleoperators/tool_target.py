@@ -13,20 +13,16 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from env_door.kinematics import InverseKinematics, UnreachableError, rotation_about
+from env_door.kinematics import InverseKinematics, UnreachableError
 from env_door.scene import UR5E, load_model
 
 from .configuration import TwistTeleoperatorConfig
 
-MAX_ITERATIONS = 30
-"""Iterations of the inverse kinematics; a step of a few centimetres takes about three."""
-
-MAX_CHANGE = 0.3
-"""Largest joint step in rad that belongs to a small step of the tool; a larger one is another way to hold the arm."""
-
-MIN_PROGRESS = 0.05
-"""Share of a step below which the arm counts as blocked."""
+MAX_ITERATIONS = 30  # of the inverse kinematics; a step of a few centimetres takes about three
+MAX_CHANGE = 0.3  # rad of a joint that belong to a small step of the tool; more is another way to hold the arm
+MIN_PROGRESS = 0.05  # share of a step below which the arm counts as blocked
 
 
 class Hindrance(Enum):
@@ -39,18 +35,16 @@ class Hindrance(Enum):
 
 
 class ToolTarget:
-    """Where the tool is to be, and the joint targets for it."""
+    """Where the tool is to be (`rotation`, (3, 3), in the frame of the arm's base), and the joint targets for it."""
 
     def __init__(self, config: TwistTeleoperatorConfig):
-        self._joint_speed = config.joint_speed
-        self._max_lead = config.max_lead
-        self._min_manipulability = config.min_manipulability
+        self._config = config
         model = load_model(UR5E.name)
         self._kinematics = InverseKinematics(model, UR5E.joints, max_iterations=MAX_ITERATIONS)
         self._ranges = np.array([model.joint(name).range for name in UR5E.joints])
         self.hindrance: Hindrance | None = None
         self._joints: NDArray[np.float64] = np.array(UR5E.ready_pose)
-        self._position, self._rotation = self._kinematics.forward(self._joints)
+        self._position, self.rotation = self._kinematics.forward(self._joints)
 
     def start(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
         """Makes the target where the arm is, at measured joints in rad, (6,), which it returns.
@@ -68,11 +62,6 @@ class ToolTarget:
         self._place(joints.copy())
         return self._joints.copy()
 
-    @property
-    def rotation(self) -> NDArray[np.float64]:
-        """`NDArray[np.float64]`: orientation that the tool is to have, (3, 3), in the frame of the arm's base."""
-        return self._rotation
-
     def step(self, twist: NDArray[np.float64], seconds: float, measured: NDArray[np.float64]) -> NDArray[np.float64]:
         """Joint targets in rad, (6,), within `max_lead` of the measured ones.
 
@@ -80,46 +69,35 @@ class ToolTarget:
         for some seconds. `hindrance` says afterwards if something is in the way.
         """
         self.hindrance = None
-        low, high = measured - self._max_lead, measured + self._max_lead
+        low, high = measured - self._config.max_lead, measured + self._config.max_lead
         followed = np.clip(self._joints, low, high)
         if not np.array_equal(followed, self._joints):
-            if np.abs(followed - self._joints).max() > self._max_lead:
+            if np.abs(followed - self._joints).max() > self._config.max_lead:
                 self.hindrance = Hindrance.MOVED
             self._place(followed)
         if twist.any():
-            position = self._position + twist[:3] * seconds
-            rotation = _turn(twist[3:] * seconds) @ self._rotation
-            joints = self._solve(position, rotation)
-            if joints is not None:
-                self._approach(joints, position, rotation, seconds, low, high)
+            self._lead(twist * seconds, self._config.joint_speed * seconds, low, high)
         return self._joints.copy()
 
-    def _solve(self, position: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def _lead(
+        self, motion: NDArray[np.float64], max_change: float, low: NDArray[np.float64], high: NDArray[np.float64]
+    ) -> None:
+        """Leads the target on by a motion of the tool, as far as the joints' largest change and bounds allow."""
+        position = self._position + motion[:3]
+        rotation = Rotation.from_rotvec(motion[3:]).as_matrix() @ self.rotation
         try:
             joints = self._kinematics.solve(position, rotation, self._joints)
         except UnreachableError:
             self.hindrance = Hindrance.UNREACHABLE
-            return None
-        manipulability = self._manipulability(joints)
-        worse = manipulability < min(self._min_manipulability, self._manipulability(self._joints))
-        if worse or np.abs(joints - self._joints).max() > MAX_CHANGE:
-            self.hindrance = Hindrance.NEAR_SINGULAR
-            return None
-        return joints
-
-    def _approach(
-        self,
-        joints: NDArray[np.float64],
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
-        seconds: float,
-        low: NDArray[np.float64],
-        high: NDArray[np.float64],
-    ) -> None:
+            return
         change = joints - self._joints
+        least = min(self._config.min_manipulability, self._manipulability(self._joints))
+        if self._manipulability(joints) < least or np.abs(change).max() > MAX_CHANGE:
+            self.hindrance = Hindrance.NEAR_SINGULAR
+            return
         moving = np.abs(change) > 1e-12
         room = np.where(change > 0, high - self._joints, low - self._joints)
-        share = min(1.0, float(np.min(self._joint_speed * seconds / np.abs(change[moving]), initial=1.0)))
+        share = float(np.min(max_change / np.abs(change[moving]), initial=1.0))
         free = float(np.min(room[moving] / change[moving], initial=1.0))
         if free < MIN_PROGRESS * share:
             self.hindrance = self.hindrance or Hindrance.BLOCKED
@@ -128,16 +106,11 @@ class ToolTarget:
             self._place(self._joints + share * change)
         else:
             # Kept as integrated, so that the tolerance of the inverse kinematics does not add up over the steps.
-            self._joints, self._position, self._rotation = joints, position, rotation
+            self._joints, self._position, self.rotation = joints, position, rotation
 
     def _place(self, joints: NDArray[np.float64]) -> None:
         self._joints = joints
-        self._position, self._rotation = self._kinematics.forward(joints)
+        self._position, self.rotation = self._kinematics.forward(joints)
 
     def _manipulability(self, joints: NDArray[np.float64]) -> float:
         return abs(float(np.linalg.det(self._kinematics.jacobian(joints))))
-
-
-def _turn(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    angle = float(np.linalg.norm(rotation))
-    return rotation_about(rotation / angle, angle) if angle > 0 else np.eye(3)

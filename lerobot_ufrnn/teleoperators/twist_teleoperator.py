@@ -16,33 +16,26 @@ from lerobot_ufrnn.robots.ur5e_robotiq.configuration import FEATURES
 
 from .arm_state import ArmState
 from .configuration import KeyboardTwistConfig, SpaceMouseTwistConfig, TwistTeleoperatorConfig
-from .device import CLOSE, OPEN, DeviceState, TwistDevice
-from .events import EventStreamDevice
+from .device import CLOSE, OPEN, DeviceState, EventStreamDevice, TwistDevice
 from .keyboard import KeyboardDevice
 from .spacemouse import SpaceMouseDevice
 from .tool_target import ToolTarget
 
 logger = logging.getLogger(__name__)
 
-MAX_STEP_SECONDS = 0.25
-"""Longest time that one action moves the target for; a loop that hangs does not make it leap."""
+MAX_STEP_SECONDS = 0.25  # that one action moves the target for; a loop that hangs does not make it leap
+PAUSE_SECONDS = 1.0  # without an action after which the target starts from where the arm is, as it did at first
+SILENCE_SECONDS = 2.0  # that a condition must have been over before the operator is told of it again
 
-PAUSE_SECONDS = 1.0
-"""Time without an action after which the target starts from where the arm is, as it did at first."""
-
-SILENCE_SECONDS = 2.0
-"""Time that a condition must have been over before the operator is told of it again."""
-
+# Ahead, left and up in the tool's own axes: z points ahead, and with the gripper level x points up.
 TOOL_FROM_OPERATOR = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
-"""Ahead, left and up in the tool's own axes: z points ahead, and with the gripper level x points up."""
 
 
 class TwistTeleoperator(Teleoperator):
-    """Turns the twist of an input device into joint targets, in the features of the robot.
+    """Turns the twist of an input device into joint targets, under the names that the robot gives its actions.
 
-    What LeRobot calls the action has the robot's own names, `<joint>.pos` in rad and `gripper.pos` from 0, open, to
-    1, closed. So the stock `lerobot-teleoperate` and `lerobot-record` need no processors, and what they record is
-    what a policy of the simulated door is trained on.
+    So the stock `lerobot-teleoperate` and `lerobot-record` need no processors, and what they record is what a policy of
+    the simulated door is trained on. Episodes are controlled with LeRobot's own keys. Collisions are not looked for.
 
     **Where it starts.** The stock loops connect the teleoperator before the robot and never tell it where the arm is; a
     pose from the configuration would be a guess, and a wrong guess a jump. So it asks the arm's controller itself,
@@ -55,13 +48,6 @@ class TwistTeleoperator(Teleoperator):
     that is gone, or an arm whose place is not known any more, ends `get_action()` with an error that says what to do;
     the stock commands then disconnect, and the robot stops the arm. Out of reach or near a singular pose, the target
     stays where it is. The operator is told once, not at every step.
-
-    Collisions of the arm are not looked for. Episodes are controlled with LeRobot's own keys (right arrow or n: next,
-    left arrow or r: again, Escape or q: stop).
-
-    Args:
-        config (`TwistTeleoperatorConfig`):
-            Address, frame, speeds and limits.
     """
 
     config_class = TwistTeleoperatorConfig
@@ -71,13 +57,14 @@ class TwistTeleoperator(Teleoperator):
         super().__init__(config)
         self.config = config
         self.clock = monotonic
-        self._scale = np.array([config.linear_speed] * 3 + [config.angular_speed] * 3)
-        self._noticed: dict[str, float] = {}
-        self._arm: ArmState | None = None
-        self._device: TwistDevice | None = None
-        self._target: ToolTarget | None = None
+        self._is_connected = False
+        self._arm = ArmState(config, self.clock)
+        self._device = self.make_own_device() if config.device is None else EventStreamDevice(config.device, self.clock)
+        self._target = ToolTarget(config)
+        self._scale = np.repeat([config.linear_speed, config.angular_speed], 3)
         self._gripper = 0.0
         self._last: float | None = None
+        self._noticed: dict[str, float] = {}
 
     @abstractmethod
     def make_own_device(self) -> TwistDevice:
@@ -85,22 +72,22 @@ class TwistTeleoperator(Teleoperator):
 
     @property
     def action_features(self) -> dict[str, type]:
-        """`dict[str, type]`: the robot's."""
+        """The robot's."""
         return dict.fromkeys(FEATURES, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """`dict[str, type]`: none; the device cannot be moved, and the arm is asked for its state directly."""
+        """None; the device cannot be moved, and the arm is asked for its state directly."""
         return {}
 
     @property
     def is_connected(self) -> bool:
-        """`bool`: whether `connect` was called and `disconnect` was not."""
-        return self._device is not None
+        """Whether `connect` was called and `disconnect` was not."""
+        return self._is_connected
 
     @property
     def is_calibrated(self) -> bool:
-        """`bool`: always; there is nothing to calibrate."""
+        """Always; there is nothing to calibrate."""
         return True
 
     def calibrate(self) -> None:
@@ -111,39 +98,25 @@ class TwistTeleoperator(Teleoperator):
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
-        """Opens the device and the connection to the arm's controller; nothing moves.
+        """Opens the connection to the arm's controller and the device; nothing moves.
 
-        Raises:
-            DeviceUnavailableError: If the device cannot be used.
-            ArmStateError: If the controller cannot be reached.
-            ImportError: If a library is missing.
+        Raises an `ArmStateError`, a `DeviceUnavailableError` or an `ImportError` that says what is missing.
         """
-        config = self.config
-        arm = ArmState(config, self.clock)
-        device = self.make_own_device() if config.device is None else EventStreamDevice(config.device, self.clock)
-        arm.open()
+        self._arm.open()
         try:
-            device.open()
+            self._device.open()
         except BaseException:
-            arm.close()
+            self._arm.close()
             raise
-        self._target = ToolTarget(config)
-        self._arm, self._device, self._last = arm, device, None
+        self._is_connected, self._last = True, None
 
     @check_if_not_connected
     def get_action(self) -> RobotAction:
-        """Joint targets for now.
+        """Joint targets for now, `<joint>.pos` in rad and `gripper.pos`; the first are where the arm is.
 
-        Returns:
-            `RobotAction`: `<joint>.pos` in rad and `gripper.pos`; the first one is where the arm is.
-
-        Raises:
-            DeviceLostError: If the device is gone.
-            ArmStateError: If it is not known where the arm is.
-            ValueError: If the arm starts beyond its joint ranges.
+        Raises a `DeviceLostError` or an `ArmStateError` if either is gone, and a `ValueError` if the arm starts beyond
+        its joint ranges.
         """
-        assert self._arm is not None
-        assert self._target is not None
         now = self.clock()
         measured = self._arm.joints()
         state = self._read_device()
@@ -155,13 +128,12 @@ class TwistTeleoperator(Teleoperator):
         else:
             seconds = min(now - self._last, MAX_STEP_SECONDS)
             joints = self._target.step(self._in_base(state.twist * self._scale), seconds, measured)
-            if self._target.hindrance is not None:
-                self._notice(self._target.hindrance.value, now)
+            if (hindrance := self._target.hindrance) is not None:
+                self._notice(hindrance.name, hindrance.value)
             closing = (CLOSE in state.buttons) - (OPEN in state.buttons)
             self._gripper = float(np.clip(self._gripper + closing * self.config.gripper_speed * seconds, 0.0, 1.0))
         self._last = now
-        values = (*joints.tolist(), self._gripper)
-        return dict(zip(FEATURES, values, strict=True))
+        return dict(zip(FEATURES, (*joints.tolist(), self._gripper), strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Nothing to do: the stock loops call this for other robots only, so nothing may depend on it."""
@@ -169,32 +141,28 @@ class TwistTeleoperator(Teleoperator):
     @check_if_not_connected
     def disconnect(self) -> None:
         """Lets go of the device and the connection. Does not fail once connected: the robot is next to be stopped."""
-        device, arm = self._device, self._arm
-        self._device = self._arm = None
-        for part in (device, arm):
-            if part is not None:
-                with contextlib.suppress(Exception):
-                    part.close()
+        self._is_connected = False
+        for part in (self._device, self._arm):
+            with contextlib.suppress(Exception):
+                part.close()
 
     def _read_device(self) -> DeviceState:
-        assert self._device is not None
         state = self._device.read()
         if (fault := state.fault()) is not None:
-            self._notice(f"The arm holds: {fault}.", self.clock(), kind="fault")
+            self._notice("fault", f"The arm holds: {fault}.")
             return DeviceState()
         return DeviceState(np.clip(state.twist, -1.0, 1.0), state.buttons)
 
-    def _notice(self, message: str, now: float, kind: str = "") -> None:
+    def _notice(self, kind: str, message: str) -> None:
         """Tells the operator of a condition once, not at every step that it lasts."""
-        before = self._noticed.get(kind or message, -np.inf)
-        self._noticed[kind or message] = now
+        now, before = self.clock(), self._noticed.get(kind, -np.inf)
+        self._noticed[kind] = now
         if now - before > SILENCE_SECONDS:
             logger.warning(message)
 
     def _in_base(self, twist: NDArray[np.float64]) -> NDArray[np.float64]:
         if self.config.frame == "base":
             return twist
-        assert self._target is not None
         return (self._target.rotation @ TOOL_FROM_OPERATOR @ twist.reshape(2, 3).T).T.ravel()
 
 

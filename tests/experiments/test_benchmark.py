@@ -1,21 +1,29 @@
 """What the benchmark computes; not how long anything takes."""
 
 import json
-import os
 import platform
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 
 import benchmark
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from benchmark import loss_of, main, make_episodes, make_model, make_scan_update, make_update, time_ticks
-from benchmark_door import of_environment, read_demo
+from benchmark import (
+    BenchmarkConfig,
+    main,
+    make_episodes,
+    make_model,
+    make_scan_update,
+    make_update,
+    take_turns,
+    time_ticks,
+)
+from draccus.utils import ParsingError
 from small_network import enlarge, network_config
-from timing import describe_machine, one_core, take_turns
 
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
@@ -37,16 +45,15 @@ def test_the_scan_computes_what_the_reference_computes():
     _, trace = model(episodes[0], torch.Generator().manual_seed(3))
     generator = torch.Generator().manual_seed(3)
     noise = torch.stack([model.foresight.sample_noise(model.network.initial_state(3), generator) for _ in range(8)])
-    expected = loss_of(model, *episodes, torch.Generator().manual_seed(3))
+    expected = benchmark.loss_of(model, *episodes, torch.Generator().manual_seed(3))
     expected.backward()
-    loss_and_gradients = scan.jax.jit(scan.jax.value_and_grad(scan.loss, has_aux=True), static_argnames="sizes")
+    loss_and_gradients = scan.jax.jit(scan.jax.value_and_grad(partial(scan.loss, config), has_aux=True))
     with scan.jax.enable_x64(True):
         (value, chosen), gradients = loss_and_gradients(
             {name: weight.detach().numpy() for name, weight in model.network.named_parameters()},
             *(values.transpose(0, 1).numpy() for values in episodes),
             noise.numpy(),
             np.stack((model.foresight.schedule.low.numpy(), model.foresight.schedule.high.numpy())),
-            sizes=scan.ScanSizes.of(config),
         )
     assert len(set(trace.chosen.flatten().tolist())) > 1
     np.testing.assert_array_equal(chosen, trace.chosen)
@@ -94,13 +101,6 @@ def test_turns_go_on_until_the_time_is_over(clock):
     assert len(take_turns({"a": lambda: clock(1)}, 10, 2)) == 10
 
 
-def test_one_core_gives_the_others_back():
-    allowed = os.sched_getaffinity(0)
-    with one_core():
-        assert (len(os.sched_getaffinity(0)), torch.get_num_threads()) == (1, 1)
-    assert os.sched_getaffinity(0) == allowed
-
-
 def test_a_round_of_a_chunked_policy_begins_with_the_tick_that_computes(clock):
     class Chunked:
         config = type("Config", (), {"n_action_steps": 4})
@@ -117,33 +117,7 @@ def test_a_round_of_a_chunked_policy_begins_with_the_tick_that_computes(clock):
     np.testing.assert_array_equal(ticks, [[8000, 0, 0, 0]] * 3)
 
 
-# ── The door and the demo ─────────────────────────────────────────────
-
-
-def test_every_way_to_run_the_door_is_measured():
-    table = of_environment(0.5, batch_size=2, asynchronous=(False,))
-    names = ["physics only", "with 128 px picture", "and 192 px video frame", "batch of 2, sync"]
-    assert list(table.what) == names
-    assert (table.calls >= 1).all()
-    assert all(float(cell.split()[0]) > 0 for cell in table["steps a second"])
-
-
-def test_the_demo_tells_its_stages_and_the_speed_of_training_without_the_autoencoder():
-    lines = [
-        "step:50 updt_s:0.900 data_s:0.500",
-        "Autoencoder done: 100 frames encoded",
-        "step:100 updt_s:0.800 data_s:0.400",
-        "step:150 updt_s:0.100 data_s:0.002",
-        "step:200 updt_s:0.300 data_s:0.004",
-        "record 34 s, train 78 s, evaluate 92 s, draw 12 s",
-    ]
-    measured = read_demo("\n".join(lines), 1620.0).set_index("what").measured.to_dict()
-    stages = {"record / s": 34, "train / s": 78, "evaluate / s": 92, "draw / s": 12, "all / s": 216}
-    training = {"update of stock training / ms": 200, "its wait for data / ms": 3}
-    assert measured == pytest.approx({**stages, "peak memory / MiB": 1620, **training})
-
-
-# ── The command ───────────────────────────────────────────────────────
+# ── What is measured ──────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("with_jax", [True, False])
@@ -154,7 +128,7 @@ def test_quick_ends_in_one_line_of_json(with_jax, monkeypatch, capsys):
         monkeypatch.setitem(sys.modules, "scan", None)
     quick_figures = benchmark.quick_figures
     monkeypatch.setattr(benchmark, "quick_figures", lambda: quick_figures(0, 1, **SMALL))
-    main(["--quick"])
+    main(BenchmarkConfig(quick=True))
     figures = json.loads(capsys.readouterr().out.splitlines()[-1])
     names = "update_speedup_vs_reference update_ratio_vs_scan select_action_p99_ms update_ms update_reference_ms "
     assert list(figures) == f"{names}update_scan_ms select_action_p50_ms".split()
@@ -175,21 +149,19 @@ def test_every_size_is_varied_around_the_papers(monkeypatch):
 
 def test_a_part_is_measured_and_written_with_the_machine(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(benchmark.PARTS, "growth", lambda seconds: pd.DataFrame({"what": ["N"], "exponent": ["0.85"]}))
-    main(["--parts=[growth]", f"--output_dir={tmp_path}"])
+    main(BenchmarkConfig(parts=("growth",), output_dir=tmp_path))
     assert "| N | 0.85 |" in capsys.readouterr().out
     content = json.loads((tmp_path / "growth.json").read_text())
     assert content["table"] == [{"what": "N", "exponent": "0.85"}]
     assert content["machine"]["AVX-512"] in ("yes", "no", "unknown")
+    assert platform.node() not in json.dumps(content) or not platform.node()
     assert (tmp_path / "growth.md").read_text().startswith("# Benchmark: growth\n\nprocessor ")
 
 
-def test_the_machine_is_described_without_its_name():
-    assert platform.node() not in json.dumps(describe_machine()) or not platform.node()
-
-
 @pytest.mark.parametrize(
-    ("flag", "message"), [("--parts=[speed]", "--parts must be of"), ("--seconds=0", "`seconds` must be above 0")]
+    ("setting", "message"),
+    [({"parts": ("speed",)}, "--parts must be of"), ({"seconds": 0}, "`seconds` must be above 0")],
 )
-def test_a_bad_flag_is_refused(flag, message):
-    with pytest.raises(ValueError, match=message):
-        main([flag])
+def test_a_bad_flag_is_refused(setting, message):
+    with pytest.raises(ParsingError, match=message):
+        BenchmarkConfig(**setting)

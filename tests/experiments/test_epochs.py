@@ -2,16 +2,19 @@ from pathlib import Path
 
 import pytest
 import yaml
-from epochs import AUTOENCODER_STEPS, Schedule, read_model
+from epochs import AUTOENCODER_STEPS, find_checkpoints, read_model
 
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
-PAPER = Schedule(autoencoder_steps=900, epoch_steps=3, steps=9900)
+DATA = 15, 2250  # episodes and frames of the demonstrations
 
 
-def settings(steps: int, batch_size: int, **policy) -> dict:
-    return {"steps": steps, "batch_size": batch_size, "policy": policy}
+def settings(steps: int, batch_size: int, save_freq: int = 0, **policy) -> dict:
+    return {"steps": steps, "batch_size": batch_size, "save_freq": save_freq, "policy": policy}
+
+
+PAPER = settings(9900, 5, save_freq=300, type="ufrnn", autoencoder={"steps": 900})
 
 
 def test_the_default_stated_without_importing_it_is_true():
@@ -21,7 +24,7 @@ def test_the_default_stated_without_importing_it_is_true():
 @pytest.mark.parametrize(
     ("model", "first", "last_epoch"),
     [
-        (settings(9900, 5, type="ufrnn", autoencoder={"steps": 900}), 903, 3000),
+        (settings(150, 5, type="ufrnn", autoencoder={"steps": 90}), 93, 20),
         (settings(404, 4, type="ufrnn"), 404, 1),  # the last batch of an epoch may be smaller
         (settings(30, 5, type="ufrnn", autoencoder={"path": "me/door"}), 3, 10),
         (settings(2820, 8, type="act"), 282, 10),
@@ -29,43 +32,38 @@ def test_the_default_stated_without_importing_it_is_true():
     ],
 )
 def test_an_epoch_is_a_pass_of_the_data_loader_after_the_autoencoder(model, first, last_epoch):
-    schedule = Schedule.of(model, num_episodes=15, num_frames=2250)
-    assert (schedule.step_of(1), schedule.last_epoch) == (first, last_epoch)
-    assert schedule.step_of(last_epoch) == model["steps"]
+    assert find_checkpoints({**model, "save_freq": 0}, *DATA, []) == ({last_epoch: model["steps"]}, model["steps"])
+    assert find_checkpoints(model, *DATA, [1])[0] == {1: first}
+    for epoch in (0, last_epoch + 1):
+        with pytest.raises(ValueError, match=rf"from 1 to {last_epoch}.*got \[{epoch}\]"):
+            find_checkpoints(model, *DATA, [epoch])
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_the_models_of_this_repository_end_with_an_epoch(path):
     model = read_model(path).settings
-    schedule = Schedule.of(model, num_episodes=15, num_frames=2250)
-    assert schedule.save_freq([schedule.last_epoch], model["save_freq"]) == model["save_freq"]
+    step_of, save_freq = find_checkpoints(model, *DATA, [])
+    assert (list(step_of.values()), save_freq) == ([model["steps"]], model["save_freq"])
 
 
 @pytest.mark.parametrize(("steps", "fitting"), [(901, 903), (9901, 9900), (899, 903)])
 def test_a_training_that_ends_within_an_epoch_is_refused_with_one_that_does_not(steps, fitting):
-    model = settings(steps, 5, type="ufrnn", autoencoder={"steps": 900})
     with pytest.raises(ValueError, match=rf"900 updates .* such as {fitting}; got {steps}"):
-        Schedule.of(model, 15, 2250)
-
-
-@pytest.mark.parametrize("epoch", [0, 3001])
-def test_an_epoch_that_training_does_not_reach_is_refused(epoch):
-    with pytest.raises(ValueError, match=rf"from 1 to 3000.*got {epoch}"):
-        PAPER.step_of(epoch)
+        find_checkpoints({**PAPER, "steps": steps}, *DATA, [])
 
 
 @pytest.mark.parametrize(
     ("epochs", "save_freq"), [([3000], 300), ([100, 500, 3000], 300), ([150], 150), (range(100, 3001, 100), 300)]
 )
 def test_every_wanted_epoch_has_a_checkpoint(epochs, save_freq):
-    found = PAPER.save_freq(epochs, 300)
-    assert found == save_freq
-    assert all(PAPER.step_of(epoch) % found == 0 or epoch == PAPER.last_epoch for epoch in epochs)
+    step_of, found = find_checkpoints(PAPER, *DATA, epochs)
+    assert (list(step_of), found) == (sorted(epochs), save_freq)
+    assert all(step % found == 0 or step == 9900 for step in step_of.values())
 
 
 def test_epochs_that_need_too_many_checkpoints_are_refused_with_what_is_allowed():
     with pytest.raises(ValueError, match=r"\[7, 100\] .* \[921, 1200\] .* every 3 updates.*divisor of at least 50"):
-        PAPER.save_freq([100, 7], 300)
+        find_checkpoints(PAPER, *DATA, [100, 7])
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,10 @@
-import os
-import signal
-import subprocess
+import fcntl
 import sys
 import threading
 
 import jobs
 import pytest
-from jobs import locked, run_command, stop, with_this_python
+from jobs import locked, run_command, stop
 from waiting import wait_until
 
 SLEEP = "import time; print('asleep', flush=True); time.sleep(60)"
@@ -27,11 +25,6 @@ def run(code: str, folder) -> None:
 def log(folder) -> str:
     path = folder / "logs" / "log"
     return path.read_text() if path.exists() else ""
-
-
-def test_commands_are_modules_of_this_python():
-    assert with_this_python("ufrnn") == [sys.executable, "-m", "lerobot_ufrnn.commands"]
-    assert with_this_python("lerobot-eval") == [sys.executable, "-m", "lerobot.scripts.lerobot_eval"]
 
 
 def test_a_command_is_printed_and_runs_on_one_thread_and_its_output_is_kept(tmp_path, capsys):
@@ -66,39 +59,27 @@ def test_stopping_ends_what_runs_and_starts_no_more(tmp_path):
     assert log(tmp_path) == "asleep\n"
 
 
-def test_a_stopped_runner_waits_for_a_lock_no_longer(tmp_path):
-    with locked(tmp_path / "lock"):
-        threading.Timer(0.1, stop).start()
-        with pytest.raises(KeyboardInterrupt), locked(tmp_path / "lock"):
-            pass
-
-
 def test_a_command_left_by_a_killed_run_keeps_its_files_locked(tmp_path, capsys):
-    code = f"""
-import sys
-from pathlib import Path
-import jobs
-jobs.with_this_python = lambda name: [sys.executable, "-c", name]
-with jobs.locked(Path("lock")) as lock:
-    sleep = "import os; print(os.getpid(), flush=True)\\n" + {SLEEP!r}
-    jobs.run_command(sleep, flags={{}}, log=Path("logs/log"), lock=lock)
-"""
-    path = os.pathsep.join([os.path.dirname(jobs.__file__), os.environ.get("PYTHONPATH", "")])
-    killed = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
-    wait_until(lambda: "asleep\n" in log(tmp_path))
-    killed.kill()
-    killed.wait()
-    left = int(log(tmp_path).splitlines()[-2])
-    free = threading.Event()
+    def work(stream) -> None:
+        with pytest.raises(RuntimeError, match="status -9"):
+            run_command(SLEEP, flags={}, log=tmp_path / "logs" / "log", lock=stream.fileno())
 
     def wait() -> None:
         with locked(tmp_path / "lock"):
             free.set()
 
-    thread = threading.Thread(target=wait)
-    thread.start()
+    free = threading.Event()
+    with (tmp_path / "lock").open("w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        working = threading.Thread(target=work, args=(stream,))
+        working.start()
+        wait_until(lambda: "asleep\n" in log(tmp_path))
+    waiting = threading.Thread(target=wait)  # the file is closed, as when its process was killed
+    waiting.start()
     assert not free.wait(0.3)
-    os.kill(left, signal.SIGKILL)
+    (left,) = jobs.running
+    left.kill()
     assert free.wait(20)
-    thread.join()
+    working.join()
+    waiting.join()
     assert "waiting for the process that works in" in capsys.readouterr().out

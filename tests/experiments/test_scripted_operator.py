@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import teleoperators_fakes as fakes
 from scipy.spatial.transform import Rotation
-from scripted_operator import REST_PERIODS, TELEOPERATOR, ToolPath, events_along, plan
+from scripted_operator import TELEOPERATOR, ToolPath, events_along, plan
 from twin import write_events
 
 from env_door.env import DoorEnv
@@ -27,10 +27,6 @@ def wander(steps=40, size=0.4) -> np.ndarray:
     """Joint angles on a smooth way from one rest to another, all joints at once."""
     ease = (1 - np.cos(np.linspace(0, np.pi, steps + 1)))[:, None] / 2
     return fakes.READY + ease * size * np.array([0.5, -0.4, 0.6, 0.3, -0.5, 1.0])
-
-
-def still(steps) -> np.ndarray:
-    return np.repeat(fakes.READY[None], steps, axis=0)
 
 
 def seconds(events) -> float:
@@ -80,37 +76,6 @@ def test_played_by_the_teleoperator_the_tool_comes_to_the_end_of_its_path(play, 
     assert actions[-1, 6] == pytest.approx(0.8, abs=1e-6 if jitter == 0 else 0.1 + jitter)
 
 
-def test_the_path_is_followed_too_slowly_for_any_limit_of_the_teleoperator():
-    path = path_of(wander(steps=4, size=1.0))
-    moving = [event for event in events_along(path) if event.twist.any()]
-    assert all(event.seconds == 0.1 for event in moving)
-    twists = np.array([event.twist for event in moving])
-    assert 0.9 < np.abs(twists).max() <= 0.95
-    # All of the way, none of it twice: 0.1 m/s at full deflection.
-    np.testing.assert_allclose(twists[:, :3].sum(axis=0) * 0.1 * 0.1, path.positions[-1] - path.positions[0], atol=1e-9)
-    # A wrist that trails its target by 0.1 s is led by 0.07 rad at most, even by an action after 0.15 s.
-    turn = still(5) + np.linspace(0, 1, 5)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
-    needed = 1.0 * (0.15 + 0.1) / 0.07 / 0.95
-    assert needed <= seconds(events_along(path_of(turn))[1:]) <= needed + 0.1
-    # Where no limit asks for more, a step of the path takes its period.
-    slow = events_along(path_of(wander(steps=4, size=0.001)))
-    assert [event.seconds for event in slow] == pytest.approx([0.1 * REST_PERIODS, 0.1, 0.1, 0.1, 0.1])
-
-
-def test_the_gripper_moves_for_itself_between_rests_with_one_button_at_a_time():
-    events = events_along(path_of(still(8), [0, 0.2, 0.5, 0.73, 0.73, 0.4, 0.13, 0.3]))
-    assert not any(event.twist.any() for event in events)
-    rest = ((), pytest.approx(0.3))
-    # At a stroke a second, in whole periods, rounded up: 0.73 closing, a step without anything, 0.6 opening, 0.17.
-    assert [(event.buttons, event.seconds) for event in events] == [
-        rest,
-        *(rest, (("close",), pytest.approx(0.8)), rest),
-        ((), 0.1),
-        *(rest, (("open",), pytest.approx(0.6)), rest),
-        *(rest, (("close",), pytest.approx(0.2)), rest),
-    ]
-
-
 def test_a_path_that_moves_tool_and_gripper_at_once_is_refused():
     with pytest.raises(ValueError, match="Step 0 of the path moves tool and gripper at once"):
         events_along(path_of(wander()[[0, 9]], [0.0, 0.5]))
@@ -119,21 +84,6 @@ def test_a_path_that_moves_tool_and_gripper_at_once_is_refused():
 @pytest.fixture(scope="module")
 def door() -> DoorEnv:
     return DoorEnv(arm="ur5e")
-
-
-def test_the_plan_begins_where_the_arm_starts_and_is_the_same_for_all_doors_until_one_is_tried(door):
-    plans = {kind: plan(door, kind, seed=4) for kind in KINDS}
-    for kind, path in plans.items():
-        door.reset(seed=4, options={"kind": kind})
-        np.testing.assert_array_equal(path.joints[0], door.measured_joints()[:-1])
-        assert path.closures[[0, -1]].tolist() == [0.0, pytest.approx(0.73, abs=0.01)]
-        grasped = int(np.argmax(path.closures > 0))
-        np.testing.assert_array_equal(path.joints[:grasped], plans["push"].joints[:grasped])
-        # Push and pull turn the tool by 0.52 rad about the upright, each its own way, and slide does not.
-        twisted = Rotation.from_rotvec([0.95, 0, 0])
-        upright = (path.rotations[-1] * path.rotations[grasped].inv() * twisted.inv()).as_rotvec()
-        turn = {"push": 0.52, "pull": -0.52, "slide": 0}[kind]
-        np.testing.assert_allclose(upright, [0, 0, turn], atol=2e-3, err_msg=kind)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -11,12 +11,13 @@ import jobs
 import pytest
 import sweep
 import yaml
-from sweep import PROVENANCE_PATH, Network, SweepConfig, main, plan, read_model, record_missing
+from sweep import PROVENANCE_PATH, Network, SweepConfig, plan, read_model, record_missing
 from tables import RESULTS, read_table
 
 from env_door import provenance
 from env_door.latch import KINDS
 from env_door.trials import Trial
+from lerobot_ufrnn.commands import parse_flags
 
 MODEL = """
 policy: {type: ufrnn, autoencoder: {steps: 4}}
@@ -168,14 +169,6 @@ def test_a_killed_training_goes_on_from_its_last_whole_checkpoint(config, fake, 
     assert list(network_of(config).checkpoints)[-1] == 16
 
 
-def test_a_training_killed_while_it_moved_its_link_goes_on_too(config, fake):
-    fake.stop_at = 6
-    with pytest.raises(KeyboardInterrupt):
-        network_of(config).run()
-    (network_of(config).folder / "train" / "checkpoints" / "last").unlink()
-    assert network_of(config).last_checkpoint == 6
-
-
 @pytest.mark.parametrize("left", ["", '{"seed": 10000, "door_k'], ids=["no trials", "half a line"])
 def test_a_killed_evaluation_is_repeated_from_scratch(config, fake, left):
     network = network_of(config)
@@ -241,19 +234,25 @@ def test_a_checkpoint_that_was_not_kept_is_reported_with_those_that_were(config,
     assert "no checkpoint of epoch 1 (update 7); it has those of updates [8, 16]" in capsys.readouterr().out
 
 
-def test_a_model_that_changed_is_not_mixed_with_its_old_self(config, capsys):
+@pytest.mark.parametrize(
+    ("model", "episodes", "change"),
+    [
+        (f"{MODEL}log_freq: 9", 14, "dataset_size was [15, 2250], now [14, 2100]"),
+        (
+            MODEL.replace("{type: ufrnn", "{type: ufrnn, foresight: {horizon: 3}"),
+            15,
+            "policy.foresight.horizon was None, now 3",
+        ),
+    ],
+)
+def test_a_network_of_another_model_or_other_demonstrations_is_not_taken_for_this(
+    config, capsys, model, episodes, change
+):
     network_of(config).run()
-    config.models[0].write_text(MODEL.replace("{type: ufrnn", "{type: ufrnn, foresight: {horizon: 3}") + "log_freq: 9")
+    config.models[0].write_text(model)
+    make_dataset(config.demonstrations, episodes)
     assert network_of(config).run() == ["one, seed 0: training"]
-    out = capsys.readouterr().out
-    assert "other settings: policy.foresight.horizon was None, now 3. Go back to them, give another --output_dir" in out
-
-
-def test_a_model_of_other_demonstrations_is_not_taken_for_one_of_these(config, capsys):
-    network_of(config).run()
-    make_dataset(config.demonstrations, episodes=14)
-    assert network_of(config).run() == ["one, seed 0: training"]
-    assert "dataset_size was [15, 2250], now [14, 2100]" in capsys.readouterr().out
+    assert f"other settings: {change}. Go back to them, give another --output_dir" in capsys.readouterr().out
 
 
 # ── The demonstrations ────────────────────────────────────────────────
@@ -280,6 +279,10 @@ def test_a_data_set_of_somebody_else_is_left_alone(config, fake):
 # ── The command ───────────────────────────────────────────────────────
 
 
+def main(flags: list[str]) -> None:
+    sweep.main(parse_flags(SweepConfig, flags, "sweep.py"))
+
+
 def flags_for(config: SweepConfig) -> list[str]:
     return [
         f"--models=[{','.join(map(str, config.models))}]",
@@ -304,16 +307,6 @@ def test_the_command_goes_on_past_a_failure_and_mends_it_when_run_again(config, 
     assert fake.names == ["lerobot-train", "lerobot-eval", "lerobot-eval"]
     assert "| two | 33, 33 | 33 | 0 | 33 | 2 x 9 | 4 |" in capsys.readouterr().out
     assert len(read_table(config.results)) == 2 * 2 * 2 * 3
-
-
-def test_an_interruption_stops_the_commands(config, monkeypatch):
-    def interrupted(*arguments, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sweep, "run_command", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        main(flags_for(config))
-    assert jobs.stopping.is_set()
 
 
 def test_a_table_of_another_kind_is_refused_before_the_work(config, fake):
@@ -353,25 +346,16 @@ def test_a_bad_flag_ends_with_what_is_allowed(config, tmp_path, flags, message):
     assert message in str(info.value)
 
 
-def script(*flags: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, sweep.__file__, *flags], capture_output=True, text=True, check=False)
-
-
-def test_as_a_script_it_ends_with_a_message_and_no_traceback():
-    done = script("--models=[]")
-    assert done.returncode == 1
-    assert done.stderr.startswith("sweep.py: --models must be one or more, ")
-
-
-def test_what_is_stated_without_importing_it_is_true():
-    assert provenance.PROVENANCE_PATH == PROVENANCE_PATH
-
-
 def test_while_the_commands_run_the_sweep_itself_holds_no_pytorch():
+    assert provenance.PROVENANCE_PATH == PROVENANCE_PATH  # stated again, since that module imports it
     code = "import sys, sweep; print('torch' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": f"{Path(sweep.__file__).parent}:{os.environ.get('PYTHONPATH', '')}"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout == "False\n"
+
+
+def script(*flags: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, sweep.__file__, *flags], capture_output=True, text=True, check=False)
 
 
 @pytest.mark.slow

@@ -13,9 +13,9 @@ from tables import (
     RESULTS,
     SUCCESS_COUNTS,
     TablesConfig,
+    difference,
     differences,
     interval,
-    interval_of_difference,
     main,
     read_table,
     summarize_networks,
@@ -92,23 +92,38 @@ def test_a_missing_table_names_the_command_that_makes_it(tmp_path):
 def test_the_interval_is_students_over_networks():
     rates = [70.0, 80.0, 84.0]
     half = 4.302653 * statistics.stdev(rates) / 3**0.5  # t of 2 degrees of freedom at 97.5 %, from a printed table
-    assert interval(rates) == pytest.approx((78 - half, 78 + half), rel=1e-6)
+    assert interval(pd.Series(rates)) == pytest.approx((78 - half, 78 + half), rel=1e-6)
 
 
 def test_an_interval_ends_where_rates_end():
-    assert interval([5.0, 95.0]) == (0, 100)
+    assert interval(pd.Series([5.0, 95.0])) == (0, 100)
 
 
 @pytest.mark.parametrize("rates", [[100.0], [100.0, 100.0, 100.0]], ids=["one network", "no difference"])
 def test_without_spread_there_is_no_interval(rates):
-    assert interval(rates) is None
+    assert interval(pd.Series(rates)) is None
+
+
+def test_the_interval_of_a_difference_is_over_pairs_or_else_welchs():
+    rates, others = pd.Series([70.0, 80.0, 84.0]), pd.Series([60.0, 79.0, 70.0])
+    gaps = [10.0, 1.0, 14.0]
+    half = 4.302653 * statistics.stdev(gaps) / 3**0.5
+    assert difference(rates, others, True) == (pytest.approx(25 / 3), pytest.approx((25 / 3 - half, 25 / 3 + half)))
+    shares = [statistics.variance(group) / 3 for group in (rates, others)]
+    freedom = sum(shares) ** 2 / sum(share**2 / 2 for share in shares)  # Welch and Satterthwaite
+    half = stats.t.ppf(0.975, freedom) * sum(shares) ** 0.5
+    assert difference(rates, others, False) == (pytest.approx(25 / 3), pytest.approx((25 / 3 - half, 25 / 3 + half)))
 
 
 @pytest.mark.parametrize("paired", [True, False])
-def test_the_interval_of_a_difference_is_that_of_scipy(paired):
-    rates, others = pd.Series([70.0, 80.0, 84.0]), pd.Series([60.0, 79.0, 70.0])
-    expected = stats.ttest_rel(rates, others) if paired else stats.ttest_ind(rates, others, equal_var=False)
-    assert interval_of_difference(rates, others, paired) == pytest.approx(tuple(expected.confidence_interval(0.95)))
+def test_networks_that_do_not_differ_or_are_too_few_have_a_difference_without_interval(paired, recwarn):
+    same, others, nothing = pd.Series([100.0, 100.0]), pd.Series([60.0, 70.0]), float("nan")
+    assert difference(same, same - 10, paired) == (10, None)
+    # 35 +- 12.71 * 5, with one degree of freedom
+    assert difference(same, others, paired) == (35, pytest.approx((-28.53, 98.53), abs=0.01))
+    assert difference(same, pd.Series([60.0, nothing]), paired) == (40, None)
+    assert difference(same, pd.Series([nothing, nothing]), paired) == (pytest.approx(nothing, nan_ok=True), None)
+    assert not recwarn
 
 
 def test_a_row_tells_each_network_and_the_mean_of_the_last_epoch():
@@ -124,7 +139,7 @@ def test_a_rate_of_nothing_is_left_out():
     table = results(opened=(9, 5, 2))
     table.loc[table.train_seed == 0, ["first_try_wrong", "recovered"]] = 0
     table.loc[table.train_seed == 1, "recovered"] = 0
-    low_and_high = interval([0.0, 50.0])
+    low_and_high = interval(pd.Series([0.0, 50.0]))
     cell = summarize_networks(table)["wrong first tries that were recovered"].item()
     assert cell == f"25 [{low_and_high[0]:.0f}, {low_and_high[1]:.0f}]"
     table[["first_try_wrong", "recovered"]] = 0
@@ -174,14 +189,15 @@ def test_the_areas_of_all_kinds_sum_up_to_the_rate_of_all_networks(tmp_path, sta
     assert stacks == [([100, 200, 300], [[0.4, 0.4, 0.3], [0.4, 0.4, 0.3]])]
 
 
-def test_a_single_epoch_is_a_bar_and_left_out_beside_others(tmp_path, stacks):
+def test_a_model_with_a_single_epoch_is_left_out_and_refused_alone(tmp_path, stacks):
     once, twice = results("once"), results("twice", epochs=(100, 200))
     draw(pd.concat([once, twice]), tmp_path / "curve.png")
-    draw(once, tmp_path / "curve.png")
-    assert [x for x, _ in stacks] == [[100, 200], [99.6, 100.4]]
+    assert [x for x, _ in stacks] == [[100, 200]]
+    with pytest.raises(ValueError, match=r"run sweep.py with --epochs"):
+        draw(once, tmp_path / "curve.png")
 
 
 def test_the_curve_is_a_command(tmp_path):
-    (tmp_path / "table.csv").write_text(results().to_csv(index=False))
+    (tmp_path / "table.csv").write_text(results(epochs=(100, 200)).to_csv(index=False))
     curve(CurveConfig(tmp_path / "table.csv", tmp_path / "curve.png"))
     assert (tmp_path / "curve.png").exists()

@@ -1,4 +1,4 @@
-"""What the experiments on the twin share: a command is started, ended in order and its end is told."""
+"""What the experiments on the twin share: a command is ended in order, its end is told, bad flags are refused."""
 
 import signal
 import sys
@@ -10,48 +10,32 @@ from twin import StockCommand, describe_failure, last_error
 from twin_faults import FaultsConfig
 from twin_recording import RecordingConfig
 from twin_trials import TrialsConfig
+from waiting import wait_until
 
 
-def python(code: str) -> StockCommand:
-    command = StockCommand("lerobot-small")
-    assert command._arguments == [sys.executable, "-m", "lerobot.scripts.lerobot_small"]
-    command._arguments[1:] = ["-c", code]
-    return command
+@pytest.fixture
+def python(monkeypatch):
+    """Lets a command be Python code that prints `here` once it is ready; waits until it has."""
+    monkeypatch.setattr(twin, "with_this_python", lambda code: [sys.executable, "-c", code])
+
+    def start(code: str) -> StockCommand:
+        command = StockCommand(code)
+        wait_until(lambda: "here" in command.output())
+        return command
+
+    return start
 
 
-def test_a_command_that_ends_without_saying_so_is_told():
-    with python("print('connected'); print('no arm'); raise SystemExit(3)") as command:
-        command.wait_for("connected", 30.0)
-        with pytest.raises(
-            RuntimeError, match=r"lerobot-small ended with status 3 before it printed 'moving'(.|\n)*no arm"
-        ):
-            command.wait_for("moving", 30.0)
-
-
-def test_a_command_that_takes_too_long_is_told():
-    with python("import time; time.sleep(60)") as command, pytest.raises(RuntimeError, match="'moving' within 0 s"):
-        command.wait_for("moving", 0.0)
-
-
-def test_a_command_heeds_an_interrupt_even_if_a_background_job_started_it():
+def test_a_command_heeds_an_interrupt_even_if_a_background_job_started_it(python):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with python("import time; print('here', flush=True); time.sleep(60)") as command:
-            command.wait_for("here", 30.0)
             command.stop()
-            assert command.process.returncode == -signal.SIGINT
+            assert command.returncode == -signal.SIGINT
             assert "KeyboardInterrupt" in command.output()
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def test_a_command_that_does_not_heed_an_interrupt_is_killed(monkeypatch):
-    monkeypatch.setattr(twin, "END_SECONDS", 0.2)
-    code = "import signal, time; signal.signal(2, signal.SIG_IGN); print('here', flush=True); time.sleep(60)"
-    with python(code) as command:
-        command.wait_for("here", 30.0)
-    assert command.process.returncode == -signal.SIGKILL
 
 
 def test_the_last_error_is_what_the_user_saw():
@@ -103,25 +87,11 @@ TRIALS = ["--policy_path=x", "--trial_log=y"]
     [
         (FaultsConfig, ["--injections=[]"], "--injections must be one or more of"),
         (FaultsConfig, ["--injections=[earthquake]"], "got ['earthquake']"),
-        (FaultsConfig, ["--seed=-1"], "`seed` must be at least 0"),
-        (TrialsConfig, [*TRIALS, "--kinds=[up]"], "--kinds must be one or more of"),
         (TrialsConfig, [*TRIALS, "--kinds=[push,push]"], "each once"),
-        (TrialsConfig, [*TRIALS, "--trials_per_kind=0"], "`trials_per_kind` must be at least 1"),
-        (TrialsConfig, [*TRIALS, "--seed=-1"], "`seed` must be at least 0"),
-        (TrialsConfig, [*TRIALS, "--duration=0"], "`duration` must be at most 3600 and above 0 s"),
         (TrialsConfig, [*TRIALS, "--hold_seconds=99"], "`hold_seconds` must be at least 0 and at most 60 s"),
         (RecordingConfig, [*RECORDING, "--kinds=[up]"], "kinds must be one or more of"),
-        (RecordingConfig, [*RECORDING, "--kinds=[push,push]"], "each once"),
-        (RecordingConfig, [*RECORDING, "--episodes_per_kind=0"], "must be at least 1, got 0"),
-        (RecordingConfig, [*RECORDING, "--seed=-1"], "got -1"),
-        (RecordingConfig, [*RECORDING, "--takes=0"], "`takes` must be at least 1"),
-        (
-            RecordingConfig,
-            [*RECORDING, "--episode_seconds=nan"],
-            "`episode_seconds` must be at least 12 and at most 60",
-        ),
+        (RecordingConfig, [*RECORDING, "--episode_seconds=nan"], "`episode_seconds` must be at least 12"),
         (RecordingConfig, ["--dataset_dir=x", "--repo_id=door"], "repo_id must read"),
-        (RecordingConfig, ["--dataset_dir=x", "--repo_id=me/eval_door"], "for evaluations"),
     ],
 )
 def test_flags_out_of_range_are_refused_before_anything_is_done(monkeypatch, script, flags, message):

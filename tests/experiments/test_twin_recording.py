@@ -28,7 +28,7 @@ class Stage:
 
     def __init__(self, *ends):
         self.ends, self.takes, self.flags = list(ends), [], []
-        self.process, self.now, self.returncode = self, "", 0
+        self.now, self.returncode = "", 0
 
     def __call__(self, *arguments, TMPDIR=None, **_):  # noqa: N803
         if TMPDIR:
@@ -134,27 +134,16 @@ def test_a_run_that_gives_up_or_is_interrupted_keeps_what_it_has_and_is_gone_on_
     assert len(stage.takes) == 2
 
 
-def test_a_first_take_that_fails_leaves_nothing(perform, tmp_path):
-    with pytest.raises(RuntimeError, match="not recorded in 1 takes"):
-        perform("fails", takes=1).run()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_command_is_the_stock_one_with_the_encoder_of_the_simulation(perform):
-    stage = perform(kinds=["pull"], seed=3)
-    stage.run()
-    (flags,) = stage.flags
-    assert stage.takes == [("pull", 3)]
-    assert flags["teleop.type"] == "spacemouse_twist"
-    assert flags["teleop.robot_ip"] == flags["robot.ip"] == Stage.address
-    assert (flags["dataset.episode_time_s"], flags["dataset.fps"], flags["resume"]) == ("15", "10", "false")
-    assert (flags["dataset.push_to_hub"], flags["play_sounds"], flags["dataset.no_stamp"]) == ("false", "false", "true")
-    assert (flags["dataset.rgb_encoder.pix_fmt"], flags["dataset.rgb_encoder.crf"]) == ('"yuv444p"', "null")
-
-
-def test_an_episode_that_is_too_short_for_its_door_is_refused(perform, tmp_path):
-    with pytest.raises(ValueError, match="--episode_seconds=12 is too short: push door, seed 0 takes"):
-        perform(episode_seconds=12).run()
+@pytest.mark.parametrize(
+    ("ends", "settings", "message"),
+    [
+        (["fails"], {"takes": 1}, "not recorded in 1 takes"),
+        ([], {"episode_seconds": 12}, "--episode_seconds=12 is too short: push door, seed 0 takes"),
+    ],
+)
+def test_without_a_first_episode_nothing_is_left(perform, tmp_path, ends, settings, message):
+    with pytest.raises((RuntimeError, ValueError), match=message):
+        perform(*ends, **settings).run()
     assert list(tmp_path.iterdir()) == []
 
 

@@ -16,9 +16,10 @@ class Script:
 
     def __init__(self, *states, ends_at: int = 10**6):
         self.states, self.asked, self.ends_at, self.resets = states, 0, ends_at, []
-        self.process = self
+        self.flags = set()
 
     def __call__(self, *flags, **_):
+        self.flags |= set(flags)
         return self
 
     def __enter__(self):
@@ -38,9 +39,8 @@ class Script:
     def arrivals(self):
         return [0.0, 0.008]
 
-    @property
-    def has_ended(self):
-        return self.asked >= self.ends_at
+    def poll(self):
+        return self.returncode if self.asked >= self.ends_at else None
 
     def stop(self):
         pass
@@ -117,6 +117,9 @@ def test_trials_go_on_where_they_stopped_and_a_roll_out_that_fails_on_the_way_is
     assert script.resets == [("pull", 8), ("push", 8), ("pull", 9), ("push", 9)]
     assert "| all | 0/4 = 0%" in capsys.readouterr().out
     assert len(read_trials(settings["trial_log"])) == 4
+    assert {"--policy.path=me/door", "--robot.ip=127.0.0.99", "--return_to_initial_position=false"} <= script.flags
+    (cameras,) = {flag for flag in script.flags if flag.startswith("--robot.cameras=")}
+    assert cameras.count("{") == cameras.count("}")
 
 
 def test_intervals_between_set_points_are_told_and_missed_ones_counted():
@@ -126,13 +129,6 @@ def test_intervals_between_set_points_are_told_and_missed_ones_counted():
         assert part in told
     assert f"99th percentile {1000 * np.percentile(intervals, 99):.2f} ms" in told
     assert twin_trials.describe_intervals(np.array([])) == "No set-points came."
-
-
-def test_the_roll_out_uses_the_twin_and_does_not_return_to_the_first_pose():
-    flags = twin_trials.rollout_flags("127.0.0.5", "me/door", 30.0)
-    assert {"--policy.path=me/door", "--robot.ip=127.0.0.5", "--return_to_initial_position=false"} <= set(flags)
-    (cameras,) = [flag for flag in flags if flag.startswith("--robot.cameras=")]
-    assert cameras.count("{") == cameras.count("}")
 
 
 @pytest.mark.slow

@@ -5,17 +5,7 @@ from collections.abc import Callable
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    """Returns as soon as the condition holds.
-
-    Args:
-        condition (`Callable[[], bool]`):
-            What is waited for.
-        seconds (`float`, *optional*, defaults to `10.0`):
-            For how long at most.
-
-    Raises:
-        AssertionError: If it does not hold in time.
-    """
+    """Returns as soon as the condition holds; an `AssertionError` tells that it did not in some seconds."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, f"did not come true within {seconds} s"

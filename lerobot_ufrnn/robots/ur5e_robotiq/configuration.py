@@ -32,9 +32,6 @@ class UR5eRobotiqConfig(RobotConfig):
 
     Observations and actions are those of the simulated door (`<joint>.pos` in rad, `gripper.pos` from 0, open, to 1,
     closed, cameras as square images), so that a checkpoint trained there loads here unchanged. So are the limits.
-
-    Raises:
-        ParsingError: If a field is out of its range.
     """
 
     ip: str

@@ -14,10 +14,7 @@ class Fault(IntEnum):
     PROTECTIVE_STOP = 3, "see why on the pendant, clear the cell, unlock the stop there, then connect again"
     EMERGENCY_STOP = 4, "make the cell safe, release the button, switch the arm on again, then connect again"
     NOT_RUNNING = 5, "switch the arm on and release its brakes on the pendant, then connect again"
-    PROGRAM_STOPPED = (
-        6,
-        "somebody stopped the program on the pendant, or it failed there; look at its log, then connect again",
-    )
+    PROGRAM_STOPPED = 6, "the program was stopped on the pendant, or failed there; look at its log, then connect again"
     COMMAND_REFUSED = 7, "look at the log on the pendant, then connect again"
     OWNER_GONE = 8, "the program that commanded the arm ended; start it again"
     SERVO_LATE = 9, "this computer could not keep up with the servo rate; close other programs, then connect again"
@@ -36,12 +33,8 @@ class Fault(IntEnum):
 
 
 class RobotFaultError(DeviceNotConnectedError):
-    """The arm was stopped, and stays so until somebody has looked and connects again.
-
-    **Attributes**:
-        fault (`Fault`): Why.
-    """
+    """The arm was stopped, for the reason `fault`, and stays so until somebody has looked and connects again."""
 
     def __init__(self, fault: Fault, detail: str):
-        self.fault = fault
+        self.fault, self.detail = fault, detail
         super().__init__(f"The arm was stopped ({fault.name.lower()}): {detail}. To go on: {fault.remedy}.")

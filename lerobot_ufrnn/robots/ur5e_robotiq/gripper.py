@@ -2,38 +2,39 @@
 
 import contextlib
 import logging
+import re
 import socket
 import threading
 import time
+from collections.abc import Iterator
 
 from .configuration import UR5eRobotiqConfig
 from .faults import Fault, RobotFaultError
 
 logger = logging.getLogger(__name__)
 
-TIMEOUT = 1.0
-"""Seconds that the gripper may take to answer."""
-
-ACTIVATION_SECONDS = 15.0
-"""Seconds that activating may take: it opens and closes once."""
-
-POLL_SECONDS = 0.05
-"""Pause between two questions; the socket takes tens of milliseconds for each anyway."""
-
-ACTIVE = 3
-"""Its status once it is activated."""
-
-FULL = 255
-"""Full speed and full force."""
-
-FIRST_FAULT = 8
-"""Fault codes below this one only say that a move waits for activation."""
+TIMEOUT = 1.0  # s that the gripper may take to answer
+ACTIVATION_SECONDS = 15.0  # that activating may take: it opens and closes once
+POLL_SECONDS = 0.05  # between two questions; the socket takes tens of milliseconds for each anyway
+ACTIVE = 3  # its status once it is activated
+FULL = 255  # full speed and full force
+FIRST_FAULT = 8  # fault codes below this one only say that a move waits for activation
 
 
 def closure_at(reading: int, gripper_range: tuple[int, int]) -> float:
     """Closure from 0, open, to 1, closed, at a reading of a gripper with this range."""
     opened, closed = gripper_range
     return min(max((reading - opened) / (closed - opened), 0.0), 1.0)
+
+
+def ask(connection: socket.socket, command: str, expected: str) -> str:
+    """What the group of a pattern finds in the answer to a command; raises an `OSError` without such an answer."""
+    connection.sendall(f"{command}\n".encode())
+    # A real URCap answers without a line end, so an answer is what comes in one piece.
+    answer = connection.recv(1024).decode(errors="replace").strip()
+    if (match := re.fullmatch(expected, answer)) is None:
+        raise ConnectionError(f"it answered {answer!r} to {command}" if answer else "it closed the connection")
+    return match[1]
 
 
 class RobotiqGripper:
@@ -44,49 +45,36 @@ class RobotiqGripper:
 
     def __init__(self, config: UR5eRobotiqConfig):
         self._config = config
-        self._socket: socket.socket | None = None
-        self._thread: threading.Thread | None = None
+        self._socket = socket.socket()
+        self._socket.settimeout(TIMEOUT)
+        self._thread = threading.Thread(target=self._follow, name="gripper", daemon=True)
         self._stop = threading.Event()
         self._target: int | None = None
         self._position = config.gripper_range[0]
         self._fault: RobotFaultError | None = None
 
     def connect(self) -> None:
-        """Connects and, if it is not active yet, activates the gripper, which then opens and closes once.
+        """Connects, once, and, if it is not active yet, activates the gripper, which then opens and closes once.
 
-        Raises a `RobotFaultError` if it does not answer, or has a fault.
+        Raises a `RobotFaultError` if it does not answer, or has a fault; it is to be disconnected then, too.
         """
         config = self._config
-        try:
-            self._socket = socket.create_connection((config.ip, config.gripper_port), TIMEOUT)
-            self._socket.settimeout(TIMEOUT)
+        with self._telling_silence():
+            self._socket.connect((config.ip, config.gripper_port))
             self._check_fault()
             if self._get("STA") != ACTIVE:
                 self._activate()
             self._set(GTO=1, SPE=round(FULL * config.gripper_speed), FOR=round(FULL * config.gripper_force))
             self._position = self._get("POS")
-        except RobotFaultError:  # which is an OSError, too
-            self.disconnect()
-            raise
-        except (OSError, ValueError) as error:
-            self.disconnect()
-            raise RobotFaultError(
-                Fault.GRIPPER_SILENT, f"the gripper at {config.ip}:{config.gripper_port} does not answer ({error})"
-            ) from error
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._follow, name="gripper", daemon=True)
         self._thread.start()
 
     def disconnect(self) -> None:
         """Lets go of the socket; the gripper stays as it is, so that it drops nothing. Safe to call at any time."""
         self._stop.set()
-        if self._thread is not None:
+        if self._thread.is_alive():
             self._thread.join(timeout=2 * TIMEOUT)
-            self._thread = None
-        if self._socket is not None:
-            with contextlib.suppress(OSError):
-                self._socket.close()
-            self._socket = None
+        with contextlib.suppress(OSError):
+            self._socket.close()
 
     @property
     def closure(self) -> float:
@@ -104,20 +92,27 @@ class RobotiqGripper:
 
     def _follow(self) -> None:
         sent = None
-        while not self._stop.wait(POLL_SECONDS):
-            try:
-                if (target := self._target) != sent and target is not None:
-                    self._set(POS=target)
-                    sent = target
-                self._position = self._get("POS")
-                self._check_fault()
-            except RobotFaultError as fault:
-                self._fault = fault
-                return
-            except (OSError, ValueError) as error:
-                if not self._stop.is_set():
-                    self._fault = RobotFaultError(Fault.GRIPPER_SILENT, f"the gripper does not answer ({error})")
-                return
+        try:
+            with self._telling_silence():
+                while not self._stop.wait(POLL_SECONDS):
+                    if (target := self._target) != sent and target is not None:
+                        self._set(POS=target)
+                        sent = target
+                    self._position = self._get("POS")
+                    self._check_fault()
+        except RobotFaultError as fault:
+            self._fault = fault
+
+    @contextlib.contextmanager
+    def _telling_silence(self) -> Iterator[None]:
+        try:
+            yield
+        except RobotFaultError:  # which is an OSError, too
+            raise
+        except OSError as error:
+            address = f"{self._config.ip}:{self._config.gripper_port}"
+            silence = f"the gripper at {address} does not answer ({error})"
+            raise RobotFaultError(Fault.GRIPPER_SILENT, silence) from error
 
     def _activate(self) -> None:
         logger.warning("The gripper is being activated: it opens and closes once.")
@@ -134,24 +129,7 @@ class RobotiqGripper:
             raise RobotFaultError(Fault.GRIPPER_FAULT, f"the gripper reports fault {fault}")
 
     def _get(self, name: str) -> int:
-        answer = self._ask(f"GET {name}")
-        kind, _, value = answer.partition(" ")
-        if kind != name or not value.strip().isdigit():
-            raise ValueError(f"it answered {answer!r} to GET {name}")
-        return int(value)
+        return int(ask(self._socket, f"GET {name}", rf"{name}\s+(\d+)"))
 
     def _set(self, **values: int) -> None:
-        command = " ".join(f"{name} {value}" for name, value in values.items())
-        if (answer := self._ask(f"SET {command}")) != "ack":
-            raise ValueError(f"it answered {answer!r} to SET {command}")
-
-    def _ask(self, command: str) -> str:
-        if self._socket is None:
-            raise ConnectionError("not connected")
-        self._socket.sendall(f"{command}\n".encode())
-        deadline = time.monotonic() + TIMEOUT
-        # A real URCap answers without a line end, so an answer is what comes in one piece.
-        data = self._socket.recv(1024)
-        if not data or time.monotonic() > deadline:
-            raise ConnectionError("it closed the connection")
-        return data.decode(errors="replace").strip()
+        ask(self._socket, "SET " + " ".join(f"{name} {value}" for name, value in values.items()), "(ack)")

@@ -13,8 +13,7 @@ LINK_OFFSETS = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
 LINK_LENGTHS = (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0)
 LINK_TWISTS = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 
-HALVINGS = 6
-"""How often a step that would leave the workspace is halved before it is not made at all."""
+HALVINGS = 6  # of a step that would leave the workspace, before it is not made at all
 
 
 def flange_position(joints: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -41,34 +40,30 @@ class Limits:
     """
 
     def __init__(self, config: UR5eRobotiqConfig):
-        self._low, self._high = np.array(config.joint_low), np.array(config.joint_high)
-        self._max_change = config.joint_speed * config.control_period
-        self._command_limit = config.command_limit
-        self._box_low, self._box_high = np.array(config.workspace_low), np.array(config.workspace_high)
+        self._config = config
 
     def check(self, action: dict[str, float]) -> tuple[NDArray[np.float64], float]:
-        """Joint targets in rad, (6,), and the gripper's from 0 to 1.
-
-        Raises a `ValueError` if a value is missing, unknown or not finite.
-        """
+        """Joint targets in rad, (6,), and the gripper's from 0 to 1; a `ValueError` says what is none of these."""
         if set(action) != set(FEATURES):
             raise ValueError(
                 f"An action must have exactly {list(FEATURES)}, got {sorted(action)}; "
                 "nothing was sent, the arm holds its pose."
             )
-        values = np.array([float(action[name]) for name in FEATURES])
-        if not np.isfinite(values).all():
-            wrong = {name: value for name, value in zip(FEATURES, values.tolist(), strict=True) if not isfinite(value)}
+        values = {name: float(action[name]) for name in FEATURES}
+        if wrong := {name: value for name, value in values.items() if not isfinite(value)}:
             raise ValueError(f"An action must be finite, got {wrong}; nothing was sent, the arm holds its pose.")
-        return values[:-1], float(np.clip(values[-1], 0.0, 1.0))
+        *target, closure = values.values()
+        return np.array(target), min(max(closure, 0.0), 1.0)
 
     def limit(
         self, target: NDArray[np.float64], commanded: NDArray[np.float64], measured: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """The target that may be sent: joint angles in rad, (6,), as are what is asked for, last sent and measured."""
-        target = np.clip(target, self._low, self._high)
-        target = np.clip(target, commanded - self._max_change, commanded + self._max_change)
-        target = np.clip(target, measured - self._command_limit, measured + self._command_limit)
+        config = self._config
+        change = config.joint_speed * config.control_period
+        target = np.clip(target, config.joint_low, config.joint_high)
+        target = np.clip(target, commanded - change, commanded + change)
+        target = np.clip(target, measured - config.command_limit, measured + config.command_limit)
         outside = self._outside(commanded)
         for halving in range(HALVINGS):
             shortened = commanded + (target - commanded) / 2**halving
@@ -79,4 +74,5 @@ class Limits:
     def _outside(self, joints: NDArray[np.float64]) -> float:
         """How far in m the flange is outside the workspace; 0 inside."""
         position = flange_position(joints)
-        return float(np.maximum(self._box_low - position, position - self._box_high).clip(min=0).max())
+        low, high = self._config.workspace_low, self._config.workspace_high
+        return float(np.abs(position - np.clip(position, low, high)).max())

@@ -5,14 +5,14 @@ import logging
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cached_property
 from types import FrameType
 from typing import Any
 
 import cv2
 import numpy as np
-from lerobot.cameras import make_cameras_from_configs
+from lerobot.cameras import Camera, make_cameras_from_configs
 from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
@@ -26,20 +26,10 @@ from .servo import Servo, import_client
 
 logger = logging.getLogger(__name__)
 
-MAX_IMAGE_AGE_MS = 500
-"""Age in ms from which an image shows something else than the measured joints."""
-
-DARK = 4.0
-"""Mean of an image, of 255, below which it shows nothing."""
-
-WRONG_SECONDS = 1.0
-"""For how long an image must be wrong; a camera may lose a frame or adjust itself."""
-
-MOVED = 0.05
-"""Distance in rad, of any joint, that cannot leave an image of the arm the same to the last bit."""
-
-ENDING_SIGNALS = ("SIGTERM", "SIGHUP")
-"""`kill`, the end of a service, a terminal or connection that is closed. Not all systems have both."""
+MAX_IMAGE_AGE_MS = 500  # from which an image shows something else than the measured joints
+DARK = 4.0  # mean of an image, of 255, below which it shows nothing
+WRONG_SECONDS = 1.0  # for which an image must be wrong; a camera may lose a frame or adjust itself
+MOVED = 0.05  # rad, of any joint, that cannot leave an image of the arm the same to the last bit
 
 
 class UR5eRobotiq(Robot):
@@ -47,11 +37,7 @@ class UR5eRobotiq(Robot):
 
     Whatever goes wrong (lost link, stale data, protective or emergency stop, stopped program, gripper fault, missing
     camera) stops the arm; `get_observation` and `send_action` then raise [`RobotFaultError`] until somebody has looked
-    and connects again. While it is connected, SIGTERM and SIGHUP end the program in order: see [`OrderlyEnd`].
-
-    Args:
-        config (`UR5eRobotiqConfig`):
-            Addresses, rates and limits.
+    and connects again. While it is connected, SIGTERM and SIGHUP end the program in order: see [`ending_in_order`].
     """
 
     config_class = UR5eRobotiqConfig
@@ -65,32 +51,30 @@ class UR5eRobotiq(Robot):
         self._servo: Servo | None = None
         self._gripper: RobotiqGripper | None = None
         self._pictures: dict[str, PictureCheck] = {}
+        self._opened = contextlib.ExitStack()
         self._fault: RobotFaultError | None = None
         self._warned = False
-        self._orderly_end = OrderlyEnd()
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
-        """`dict`: `<joint>.pos` and `gripper.pos` as `float`, and each camera's image shape."""
+        """`<joint>.pos` and `gripper.pos`, and each camera's image shape."""
         size = self.config.image_size
-        images = {
-            name: (size, size, 3) if size else (camera.height, camera.width, 3) for name, camera in self.cameras.items()
-        }
-        return {**self.action_features, **images}
+        shapes = {name: (size or camera.height, size or camera.width, 3) for name, camera in self.cameras.items()}
+        return {**self.action_features, **shapes}
 
     @cached_property
     def action_features(self) -> dict[str, type]:
-        """`dict`: `<joint>.pos` in rad and `gripper.pos` from 0 to 1."""
+        """`<joint>.pos` in rad and `gripper.pos` from 0 to 1."""
         return dict.fromkeys(FEATURES, float)
 
     @property
     def is_connected(self) -> bool:
-        """`bool`: whether it holds connections, those of a stopped arm included."""
+        """Whether it holds connections, those of a stopped arm included."""
         return self._servo is not None
 
     @property
     def is_calibrated(self) -> bool:
-        """`bool`: always; the arm knows its joint angles."""
+        """Always; the arm knows its joint angles."""
         return True
 
     def calibrate(self) -> None:
@@ -103,23 +87,25 @@ class UR5eRobotiq(Robot):
     def connect(self, calibrate: bool = True) -> None:
         """Connects cameras, gripper and arm, in this order, and holds the arm where it is.
 
-        Raises:
-            RobotFaultError: If one of them is not ready; nothing stays connected.
+        Raises a `RobotFaultError` if one of them is not ready; nothing stays connected.
         """
         self._fault = None
         self._pictures = {name: PictureCheck(name) for name in self.cameras}
-        self._orderly_end.begin()
         try:
+            self._opened.enter_context(ending_in_order())
             self._check_ready()
             for name, camera in self.cameras.items():
+                self._opened.callback(_close, camera)
                 try:
                     camera.connect()
                 except Exception as error:
                     raise RobotFaultError(Fault.CAMERA, f"camera '{name}' cannot be opened: {error}") from error
             if self.config.gripper_port:
                 self._gripper = RobotiqGripper(self.config)
+                self._opened.callback(self._gripper.disconnect)
                 self._gripper.connect()
             self._servo = Servo(self.config)
+            self._opened.callback(self._servo.stop)
             self._servo.start()
         except BaseException:
             self._release()
@@ -135,9 +121,8 @@ class UR5eRobotiq(Robot):
             safety, mode = dashboard.safetystatus(), dashboard.robotmode()
             is_remote = dashboard.isInRemoteControl()
         except RuntimeError as error:
-            raise RobotFaultError(
-                Fault.LINK_LOST, f"no controller answers at {self.config.ip}, port 29999: {error}"
-            ) from error
+            silence = f"no controller answers at {self.config.ip}, port 29999: {error}"
+            raise RobotFaultError(Fault.LINK_LOST, silence) from error
         finally:
             with contextlib.suppress(RuntimeError):
                 dashboard.disconnect()
@@ -151,59 +136,42 @@ class UR5eRobotiq(Robot):
 
     @check_if_not_connected
     def get_observation(self) -> RobotObservation:
-        """Measured joints, and the latest image of each camera.
+        """Measured `<joint>.pos` in rad, `gripper.pos` from 0 to 1, and the latest images, (height, width, 3) uint8.
 
-        Returns:
-            `RobotObservation`: `<joint>.pos` in rad, `gripper.pos` from 0 to 1, and images, (height, width, 3) uint8.
-
-        Raises:
-            RobotFaultError: If the arm was stopped, now or before.
+        Raises a `RobotFaultError` if the arm was stopped, now or before.
         """
-        with self._stopping_on_fault():
-            assert self._servo is not None
-            measured, _ = self._servo.read()
+        with self._stopping_on_fault() as servo:
+            measured, _ = servo.read()
             closure = self._gripper.closure if self._gripper is not None else 0.0
-            values = [*measured, closure]
-            observation: dict[str, Any] = {name: float(value) for name, value in zip(FEATURES, values, strict=True)}
+            observation: dict[str, Any] = dict(zip(FEATURES, [*measured.tolist(), closure], strict=True))
             for name, camera in self.cameras.items():
                 try:
                     image = camera.read_latest(max_age_ms=MAX_IMAGE_AGE_MS)
                 except Exception as error:
                     raise RobotFaultError(Fault.CAMERA, f"camera '{name}' gives no image: {error}") from error
-                self._pictures[name].check(image, measured)
+                self._pictures[name].check(image, measured, time.monotonic())
                 observation[name] = fit_image(image, self.config.image_size)
         return observation
 
     @check_if_not_connected
     def send_action(self, action: RobotAction) -> RobotAction:
-        """Moves towards joint targets, within the limits.
-
-        Args:
-            action (`RobotAction`):
-                `<joint>.pos` in rad and `gripper.pos` from 0 to 1.
-
-        Returns:
-            `RobotAction`: what was sent, which is what to record.
+        """Moves towards joint targets, within the limits; returns what was sent, which is what to record.
 
         Raises:
             ValueError: If the action has other keys or is not finite; nothing is sent and the arm holds its pose.
             RobotFaultError: If the arm was stopped, now or before.
         """
-        with self._stopping_on_fault():
-            assert self._servo is not None
+        with self._stopping_on_fault() as servo:
             asked, closure = self._limits.check(action)
-            measured, commanded = self._servo.read()
+            measured, commanded = servo.read()
             target = self._limits.limit(asked, commanded, measured)
-            if not self._warned and np.abs(target - asked).max() > self.config.command_limit:
+            if not self._warned and (cut := np.abs(target - asked).max()) > self.config.command_limit:
                 self._warned = True
-                logger.warning(
-                    "An action asked for joints up to %.2f rad from what the limits allow; it and others are limited.",
-                    np.abs(target - asked).max(),
-                )
-            self._servo.move_to(target)
+                logger.warning("An action asked for joints %.2f rad beyond the limits; it and others are limited.", cut)
+            servo.move_to(target)
             if self._gripper is not None:
                 self._gripper.move_to(closure)
-        return {name: float(value) for name, value in zip(FEATURES, [*target, closure], strict=True)}
+        return dict(zip(FEATURES, [*target.tolist(), closure], strict=True))
 
     @check_if_not_connected
     def disconnect(self) -> None:
@@ -212,13 +180,13 @@ class UR5eRobotiq(Robot):
         logger.info("%s disconnected.", self)
 
     @contextlib.contextmanager
-    def _stopping_on_fault(self) -> Iterator[None]:
+    def _stopping_on_fault(self) -> Iterator[Servo]:
         if self._fault is not None:
             raise self._fault
+        assert self._servo is not None
         try:
-            yield
+            yield self._servo
         except RobotFaultError as fault:
-            assert self._servo is not None
             self._servo.stop()
             cause = self._servo.fault
             if cause is None or cause.fault is fault.fault:
@@ -229,17 +197,14 @@ class UR5eRobotiq(Robot):
             raise cause from fault
 
     def _release(self) -> None:
-        if self._servo is not None:
-            self._servo.stop()
-            self._servo = None
-        if self._gripper is not None:
-            self._gripper.disconnect()
-            self._gripper = None
-        for camera in self.cameras.values():
-            with contextlib.suppress(Exception):
-                if camera.is_connected:
-                    camera.disconnect()
-        self._orderly_end.end()
+        self._servo = self._gripper = None
+        self._opened.close()  # in reverse order: the arm is stopped first
+
+
+def _close(camera: Camera) -> None:
+    with contextlib.suppress(Exception):
+        if camera.is_connected:
+            camera.disconnect()
 
 
 def fit_image(image: np.ndarray, size: int) -> np.ndarray:
@@ -256,72 +221,61 @@ def fit_image(image: np.ndarray, size: int) -> np.ndarray:
 class PictureCheck:
     """Notices images of a camera that arrive in time and still show nothing: black ones, and one that never changes."""
 
-    def __init__(self, camera: str, clock: Callable[[], float] = time.monotonic):
+    def __init__(self, camera: str):
         self._camera = camera
-        self._clock = clock
         self._dark_since: float | None = None
         self._last: NDArray[np.uint8] | None = None
         self._last_since = 0.0
-        self._last_joints: NDArray[np.float64] = np.empty(0)
+        self._last_joints: NDArray[np.float64] = np.zeros(6)
 
-    def check(self, image: NDArray[np.uint8], joints: NDArray[np.float64]) -> None:
-        """Looks at a picture, (height, width, 3), taken at measured joints in rad, (6,).
+    def check(self, image: NDArray[np.uint8], joints: NDArray[np.float64], now: float) -> None:
+        """Looks at an image, (height, width, 3), taken at measured joints in rad, (6,), at a time in s.
 
-        Raises a `RobotFaultError` if pictures have been black, or the same although the arm moved, for a second.
+        Raises a `RobotFaultError` if images have been black, or the same although the arm moved, for a second.
         """
-        now = self._clock()
         if image.mean() >= DARK:
             self._dark_since = None
         elif self._dark_since is None:
             self._dark_since = now
-        elif now - self._dark_since >= WRONG_SECONDS:
-            raise RobotFaultError(
-                Fault.CAMERA, f"camera '{self._camera}' has been black for {now - self._dark_since:.1f} s"
-            )
+        elif (seconds := now - self._dark_since) >= WRONG_SECONDS:
+            raise RobotFaultError(Fault.CAMERA, f"camera '{self._camera}' has been black for {seconds:.1f} s")
         if self._last is None or not np.array_equal(image, self._last):
             self._last, self._last_since, self._last_joints = image.copy(), now, joints.copy()
-        elif now - self._last_since >= WRONG_SECONDS and np.abs(joints - self._last_joints).max() >= MOVED:
-            raise RobotFaultError(
-                Fault.CAMERA,
-                f"camera '{self._camera}' has sent the same picture for {now - self._last_since:.1f} s, in which the "
-                f"arm moved by {np.abs(joints - self._last_joints).max():.2f} rad",
-            )
+        seconds, moved = now - self._last_since, np.abs(joints - self._last_joints).max()
+        if seconds >= WRONG_SECONDS and moved >= MOVED:
+            same = f"the same picture for {seconds:.1f} s, in which the arm moved by {moved:.2f} rad"
+            raise RobotFaultError(Fault.CAMERA, f"camera '{self._camera}' has sent {same}")
 
 
-class OrderlyEnd:
+@contextlib.contextmanager
+def ending_in_order() -> Iterator[None]:
     """Lets a program that is told to end do so in order: as with Ctrl-C, what it has to close is closed.
 
-    Python ends at once on these signals. The arm is stopped in any case, but `lerobot-record` would lose every episode
-    of its session: LeRobot writes the ends of the files, without which they cannot be read, when the recording ends.
-    A program that deals with a signal by itself, or ignores it as under `nohup`, goes on doing so.
+    Python ends at once on SIGTERM and SIGHUP; here they raise `SystemExit`. The arm is stopped in any case, but
+    `lerobot-record` would lose every episode of its session: LeRobot writes the ends of the files, without which they
+    cannot be read, when the recording ends. A program that deals with a signal by itself, or ignores it as under
+    `nohup`, goes on doing so. Only the main thread may do all this; in others nothing happens.
     """
+    taken: list[int] = []
 
-    def __init__(self) -> None:
-        self._taken: list[int] = []
-
-    def begin(self) -> None:
-        """From now on these signals raise `SystemExit`. Only the main thread may do this; in others nothing happens."""
-        if threading.current_thread() is not threading.main_thread():
-            return
-        for name in ENDING_SIGNALS:
-            number = getattr(signal, name, None)
-            if number is not None and signal.getsignal(number) == signal.SIG_DFL:
-                signal.signal(number, self._end)
-                self._taken.append(number)
-
-    def end(self) -> None:
-        """Restores what was before. Safe to call at any time."""
-        if threading.current_thread() is not threading.main_thread():
-            return
-        while self._taken:
-            number = self._taken.pop()
-            # Somebody else may have taken the signal over meanwhile.
-            if signal.getsignal(number) in (self._end, signal.SIG_IGN):
-                signal.signal(number, signal.SIG_DFL)
-
-    def _end(self, number: int, frame: FrameType | None) -> Any:
-        for taken in self._taken:
+    def end(number: int, frame: FrameType | None) -> None:
+        for each in taken:
             # Asked for once more, the program would be torn from what it closes.
-            signal.signal(taken, signal.SIG_IGN)
+            signal.signal(each, signal.SIG_IGN)
         logger.warning("Ending, as asked for by %s: what is open is closed first.", signal.Signals(number).name)
         raise SystemExit(128 + number)
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):  # by `kill` or a closed terminal; not all systems have both
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) == signal.SIG_DFL:
+                signal.signal(number, end)
+                taken.append(number)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number in taken:
+                # Somebody else may have taken the signal over meanwhile.
+                if signal.getsignal(number) in (end, signal.SIG_IGN):
+                    signal.signal(number, signal.SIG_DFL)

@@ -11,7 +11,6 @@ import signal
 import sys
 import time
 import traceback
-from dataclasses import dataclass
 from multiprocessing.context import BaseContext
 from typing import Any
 
@@ -21,20 +20,11 @@ from numpy.typing import NDArray
 from .configuration import UR5eRobotiqConfig
 from .faults import Fault, RobotFaultError
 
-START_SECONDS = 60.0
-"""How long connecting may take; the client uploads a program and waits for it to run."""
-
-STOP_DECELERATION = 4.0
-"""Deceleration in rad/s^2 with which the arm is stopped."""
-
-SETTLE_SECONDS = 0.1
-"""How long the values that tell of one cause may take to come in."""
-
-SILENT_SECONDS = 0.5
-"""How much longer than `stale_after` nothing may be heard of the servo process; it tells of faults within that time."""
-
-STOP_SECONDS = 5.0
-"""How long the servo process may take to end by itself; by then the controller's watchdog has stopped the arm."""
+START_SECONDS = 60.0  # that connecting may take; the client uploads a program and waits for it to run
+STOP_DECELERATION = 4.0  # in rad/s^2, with which the arm is stopped
+SETTLE_SECONDS = 0.1  # that the values that tell of one cause may take to come in
+SILENT_SECONDS = 0.5  # beyond `stale_after` that the servo process may be silent; it tells of faults within that time
+STOP_SECONDS = 5.0  # that it may take to end by itself; by then the controller's watchdog has stopped the arm
 
 # Modes as the controller numbers them.
 ROBOT_MODE_RUNNING = 7
@@ -94,15 +84,13 @@ class Mailbox:
         return numbers[:1], numbers[1:].reshape(2, -1)
 
 
-@dataclass
 class _Shared:
     """What the servo process and its owner have in common."""
 
-    targets: Mailbox
-    state: Mailbox
-    text: Any
-    stop: Any
-    ready: Any
+    def __init__(self, context: BaseContext):
+        self.targets, self.state = Mailbox(context, 6), Mailbox(context, STATE_SIZE)
+        self.text: Any = context.RawArray("c", TEXT_SIZE)
+        self.stop, self.ready = context.Event(), context.Event()
 
 
 class Servo:
@@ -111,16 +99,9 @@ class Servo:
     def __init__(self, config: UR5eRobotiqConfig):
         self._config = config
         context = multiprocessing.get_context("spawn")
-        self._shared = _Shared(
-            targets=Mailbox(context, 6),
-            state=Mailbox(context, STATE_SIZE),
-            text=context.RawArray("c", TEXT_SIZE),
-            stop=context.Event(),
-            ready=context.Event(),
-        )
-        self._process = context.Process(
-            target=_run, args=(config, os.getpid(), self._shared), name="ur5e-servo", daemon=True
-        )
+        self._shared = _Shared(context)
+        arguments = config, os.getpid(), self._shared
+        self._process = context.Process(target=_run, args=arguments, name="ur5e-servo", daemon=True)
 
     def start(self) -> None:
         """Connects and holds the arm where it is, or raises a `RobotFaultError`."""
@@ -130,9 +111,8 @@ class Servo:
             if not self._process.is_alive() or time.monotonic() > deadline:
                 fault = self.fault
                 self.stop()
-                raise fault or RobotFaultError(
-                    Fault.LINK_LOST, f"connecting to {self._config.ip} took longer than {START_SECONDS:.0f} s"
-                )
+                late = f"connecting to {self._config.ip} took longer than {START_SECONDS:.0f} s"
+                raise fault or RobotFaultError(Fault.LINK_LOST, late)
 
     def stop(self) -> None:
         """Decelerates the arm, ends the program on the controller and the process. Safe to call at any time."""
@@ -145,7 +125,7 @@ class Servo:
 
     @property
     def fault(self) -> RobotFaultError | None:
-        """`RobotFaultError | None`: why the arm was stopped, if it was."""
+        """Why the arm was stopped, if it was."""
         _, values = self._shared.state.read()
         fault = Fault(int(values[FAULT]))
         if fault is not Fault.NONE:
@@ -161,26 +141,15 @@ class Servo:
 
     def read(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Measured and commanded joints in rad, (6,) each; raises a `RobotFaultError` if the arm was stopped."""
-        self._check()
+        if (fault := self.fault) is not None:
+            raise fault
         _, values = self._shared.state.read()
         return values[MEASURED], values[COMMANDED]
 
     def move_to(self, target: NDArray[np.float64]) -> None:
-        """Sets the target, in rad and within all limits, (6,), that the arm is to be at one control period from now.
-
-        Raises a `RobotFaultError` if the arm was stopped.
-        """
-        self._check()
+        """Sets the target, in rad and within all limits, (6,), that the arm is to be at one control period from now."""
+        self.read()  # which raises if the arm was stopped
         self._shared.targets.write(target)
-
-    def _check(self) -> None:
-        if (fault := self.fault) is not None:
-            raise fault
-
-
-class _StopError(Exception):
-    def __init__(self, fault: Fault, detail: str):
-        self.fault, self.detail = fault, detail
 
 
 def _run(config: UR5eRobotiqConfig, owner: int, shared: _Shared) -> None:
@@ -194,7 +163,7 @@ def _run(config: UR5eRobotiqConfig, owner: int, shared: _Shared) -> None:
     try:
         driver.connect()
         driver.drive()
-    except _StopError as stopped:
+    except RobotFaultError as stopped:
         driver.tell(stopped.fault, stopped.detail)
         link_works = stopped.fault not in (Fault.LINK_LOST, Fault.STALE_DATA)
     except Exception as error:
@@ -225,9 +194,9 @@ class _Driver:
             self._receive = rtde_receive.RTDEReceiveInterface(config.ip, config.servo_frequency)
             self._control = rtde_control.RTDEControlInterface(config.ip, config.servo_frequency)
         except RuntimeError as error:
-            raise _StopError(Fault.LINK_LOST, f"cannot connect to {config.ip}: {error}") from error
+            raise RobotFaultError(Fault.LINK_LOST, f"cannot connect to {config.ip}: {error}") from error
         if not self._control.setWatchdog(config.watchdog_frequency):
-            raise _StopError(Fault.COMMAND_REFUSED, "the controller's watchdog could not be armed")
+            raise RobotFaultError(Fault.COMMAND_REFUSED, "the controller's watchdog could not be armed")
 
     def drive(self) -> None:
         """Sends set-points, on a straight line from target to target, until the owner ends it or something is wrong."""
@@ -256,11 +225,11 @@ class _Driver:
                 # The controller ignores speed and acceleration here.
                 taken = control.servoJ(commanded.tolist(), 0.0, 0.0, period, config.servo_lookahead, config.servo_gain)
             except RuntimeError as error:  # the client found the link broken and tried in vain to mend it
-                raise _StopError(Fault.LINK_LOST, str(error)) from error
+                raise RobotFaultError(Fault.LINK_LOST, str(error)) from error
             if not taken:
                 time.sleep(SETTLE_SECONDS)
                 self._check(now, stamped)
-                raise _StopError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
+                raise RobotFaultError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
             # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
             values[MEASURED], values[COMMANDED], values[MOMENT] = measured, commanded, time.monotonic()
             shared.state.write(values)
@@ -268,7 +237,7 @@ class _Driver:
             due += period
             if (behind := time.monotonic() - due) > 0:
                 if behind > config.stale_after:
-                    raise _StopError(Fault.SERVO_LATE, f"a set-point came {1000 * behind:.0f} ms late")
+                    raise RobotFaultError(Fault.SERVO_LATE, f"a set-point came {1000 * behind:.0f} ms late")
                 due = time.monotonic()
             else:
                 time.sleep(-behind)
@@ -294,28 +263,28 @@ class _Driver:
     def _check(self, now: float, stamped: float) -> None:
         """Looks for a reason to stop."""
         if not (self._receive.isConnected() and self._control.isConnected()):
-            raise _StopError(Fault.LINK_LOST, f"the connection to {self._config.ip} broke")
+            raise RobotFaultError(Fault.LINK_LOST, f"the connection to {self._config.ip} broke")
         if now - stamped > self._config.stale_after:
-            silent = f"no new data from {self._config.ip} for {1000 * (now - stamped):.0f} ms"
-            raise _StopError(Fault.STALE_DATA, silent)
+            silent = 1000 * (now - stamped)
+            raise RobotFaultError(Fault.STALE_DATA, f"no new data from {self._config.ip} for {silent:.0f} ms")
         self._check_interruption()
         if os.getppid() != self._owner:
-            raise _StopError(Fault.OWNER_GONE, "the program that commanded it ended")
+            raise RobotFaultError(Fault.OWNER_GONE, "the program that commanded it ended")
 
     def _check_interruption(self) -> None:
         if self._interruption() is not None:
             # One cause shows in several values, which come one after the other and over two connections: nothing more
             # is commanded while the rest comes in, then the most telling one counts.
             time.sleep(SETTLE_SECONDS)
-            paused = _StopError(Fault.PROGRAM_STOPPED, "the controller paused the program")
+            paused = RobotFaultError(Fault.PROGRAM_STOPPED, "the controller paused the program")
             raise self._interruption() or paused
 
-    def _interruption(self) -> _StopError | None:
+    def _interruption(self) -> RobotFaultError | None:
         """Why the controller does not carry out commands, if it says so; the most telling reason first."""
         if (safety := self._receive.getSafetyMode()) not in (SAFETY_NORMAL, SAFETY_REDUCED):
-            return _StopError(STOPPED_BY_SAFETY.get(safety, Fault.PROTECTIVE_STOP), f"safety mode {safety}")
+            return RobotFaultError(STOPPED_BY_SAFETY.get(safety, Fault.PROTECTIVE_STOP), f"safety mode {safety}")
         if (mode := self._receive.getRobotMode()) != ROBOT_MODE_RUNNING:
-            return _StopError(Fault.NOT_RUNNING, f"robot mode {mode} instead of {ROBOT_MODE_RUNNING} (running)")
+            return RobotFaultError(Fault.NOT_RUNNING, f"robot mode {mode} instead of {ROBOT_MODE_RUNNING} (running)")
         if not self._control.isProgramRunning():
-            return _StopError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
+            return RobotFaultError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
         return None

@@ -3,12 +3,12 @@
 import asyncio
 import socket
 import struct
+from functools import partial
 
 import pytest
 
 from env_door.twin import free_address, ports
-from env_door.twin.configuration import TwinConfig
-from env_door.twin.server import Twin
+from env_door.twin.server import Twin, TwinConfig
 
 
 class TurnedTwin(Twin):
@@ -82,18 +82,15 @@ class Client:
             self.received = self.received[size:]
         return found
 
-    def send(self, kind, body=b""):
-        self.put(struct.pack(">HB", 3 + len(body), ord(kind)) + body)
-
     def exchange(self, kind, body=b""):
         """Answer to a package of RTDE."""
-        self.send(kind, body)
+        self.put(struct.pack(">HB", 3 + len(body), ord(kind)) + body)
         self.turn(2)
         return next(answer for name, answer in self.packages() if name == kind)
 
     def command(self, number, *values):
         """A command to the control script, through the first recipe of inputs."""
-        self.send("U", struct.pack(">Bi11d", 1, number, *values, *[0.0] * (11 - len(values))))
+        self.put(struct.pack(">HBBi11d", 96, ord("U"), 1, number, *values, *[0.0] * (11 - len(values))))
 
 
 @pytest.fixture
@@ -105,16 +102,16 @@ def twin():
 
 @pytest.fixture
 def connect(twin):
-    return lambda port: Client(twin, port)
+    return partial(Client, twin)
 
 
 @pytest.fixture
-def upload(connect):
+def upload(twin, connect):
     def upload(name="rtde_control"):
         client = connect(ports.SCRIPT[-1])
         client.put(f"def {name}():\n    global reg_offset_int = # int register offset\n0\n    end\n".encode())
         client.turn(20)
-        assert client.twin.state()["program"] == "STOPPED"
+        assert twin.state()["program"] == "STOPPED"
         client.put(b"end\n")
         client.turn(20)
 

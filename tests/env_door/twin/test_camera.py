@@ -7,8 +7,7 @@ from env_door.env import DoorEnv
 from env_door.rendering import make_renderer
 from env_door.twin import TwinProcess, free_address
 from env_door.twin.camera import HEIGHT, WIDTH
-from env_door.twin.configuration import TwinConfig
-from env_door.twin.server import Twin
+from env_door.twin.server import Twin, TwinConfig
 
 
 def test_without_pyzmq_it_says_what_to_install(monkeypatch):

@@ -22,7 +22,7 @@ def check(dashboard, *dialogue):
 
 def test_protective_stop_waits_before_it_can_be_unlocked(twin, dashboard, upload):
     upload()
-    twin.injections.start("protective_stop")
+    twin.inject("protective_stop")
     assert dashboard.ask("unlock protective stop").startswith("Cannot unlock protective stop until 5s")
     check(
         dashboard,
@@ -38,7 +38,7 @@ def test_protective_stop_waits_before_it_can_be_unlocked(twin, dashboard, upload
 
 
 def test_power_comes_back_step_by_step(twin, connect, dashboard):
-    twin.injections.start("emergency_stop")
+    twin.inject("emergency_stop")
     check(dashboard, ("robotmode", "Robotmode: POWER_OFF", 0), ("power on", "Powering on", 200))
     check(dashboard, ("robotmode", "Robotmode: POWER_OFF", 0))
     connect(ports.TWIN).ask('{"do": "clear"}')
@@ -47,7 +47,7 @@ def test_power_comes_back_step_by_step(twin, connect, dashboard):
 
 
 def test_local_control_refuses_programs_and_commands(twin, dashboard, upload):
-    twin.injections.start("remote_control_off")
+    twin.inject("remote_control_off")
     check(dashboard, ("is in remote control", "false", 0), ("power off", "Failed to execute: power off", 0))
     upload()
     assert twin.state()["program"] == "STOPPED"

@@ -22,31 +22,22 @@ class Fingers:
 
 
 @pytest.fixture
-def gripper():
-    made = GripperModel()
-    made.switch_on(0.0)
-    return made
-
-
-@pytest.fixture
-def active(gripper):
+def active():
+    gripper = GripperModel()
     gripper.set({"ACT": 1})
     Fingers(gripper).run(1.1)
     return gripper
 
 
-def test_activation_takes_a_moment(gripper):
-    assert gripper.get("STA") == "0"
+def test_it_moves_once_it_is_activated_which_takes_a_moment():
+    gripper = GripperModel()
+    gripper.set({"GTO": 1, "SPE": 255, "POS": 255})
+    assert Fingers(gripper).run(1.0).closure == 0.0
+    assert (gripper.get("STA"), gripper.get("FLT")) == ("0", "7")
     gripper.set({"ACT": 1})
     for seconds, status in ((0.5, "1"), (0.6, "3")):
         Fingers(gripper).run(seconds)
         assert gripper.get("STA") == status
-
-
-def test_it_does_not_move_before_it_is_activated(gripper):
-    gripper.set({"GTO": 1, "SPE": 255, "POS": 255})
-    assert Fingers(gripper).run(1.0).closure == 0.0
-    assert gripper.get("FLT") == "7"
 
 
 @pytest.mark.parametrize(("speed", "seconds"), [(255, 85 / 150), (0, 85 / 20)])
@@ -79,8 +70,8 @@ def test_a_major_fault_lasts_until_it_is_activated_again(active):
     active.fail(14)
     active.fail(0)
     assert active.get("FLT") == "14"
-    active.set({"ACT": 0})
-    active.set({"ACT": 1})
+    for value in (0, 1):
+        active.set({"ACT": value})
     Fingers(active).run(1.1)
     assert (active.get("FLT"), active.get("STA")) == ("0", "3")
 
@@ -127,9 +118,9 @@ def test_the_socket_takes_split_and_joined_lines_and_can_be_made_to_fail(twin, c
     client.put(b"OS\nGET STA\n")
     client.turn()
     assert client.take() == "POS 3\nSTA 0\n"
-    twin.injections.start("gripper_garbage")
+    twin.inject("gripper_garbage")
     garbage = client.ask("GET POS")
     assert garbage
     assert not garbage.startswith("POS")
-    twin.injections.start("gripper_silent")
+    twin.inject("gripper_silent")
     assert client.ask("GET POS") == ""

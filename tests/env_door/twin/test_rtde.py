@@ -39,8 +39,12 @@ def test_measurements_are_those_of_the_scene_at_the_rate_asked_for(rtde):
     assert not rtde.packages()
 
 
-def test_an_unknown_variable_is_named_and_nothing_starts(rtde):
+def test_an_unknown_variable_is_named_and_nothing_starts_or_goes_on(rtde):
+    ask_for(rtde, b"timestamp")
+    rtde.exchange("S")
     assert ask_for(rtde, b"timestamp,nonsense") == b"\x00DOUBLE,NOT_FOUND"
+    rtde.turn(10)
+    assert not rtde.packages()
     assert rtde.exchange("S") == b"\x00"
 
 

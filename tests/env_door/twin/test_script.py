@@ -14,9 +14,8 @@ SERVO = (0.5, 0.5, 0.008, 0.1, 300.0)
 def script(connect, upload):
     upload()
     client = connect(ports.RTDE)
-    client.exchange(
-        "I", ",".join(["input_int_register_0", *map("input_double_register_{}".format, range(11))]).encode()
-    )
+    names = ["input_int_register_0", *(f"input_double_register_{i}" for i in range(11))]
+    client.exchange("I", ",".join(names).encode())
     assert client.twin.state()["program"] == "PLAYING"
     return client
 

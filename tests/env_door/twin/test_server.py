@@ -26,12 +26,6 @@ def test_trials_are_those_of_the_environment(twin, kind):
     assert not state["attempts"]
 
 
-def test_a_new_trial_can_leave_the_arm_where_it_is(twin):
-    before = twin.state()["joints"]
-    assert twin.reset(seed=99, keep_arm=True)["joints"] == before
-    assert twin.reset(seed=99)["joints"] != before
-
-
 def test_somebody_holds_the_door_for_a_while(twin, requests):
     assert requests.ask('{"do": "hold", "seconds": 0.1}') == '{"ok": true}\n'
     assert twin.state()["held"]

@@ -48,14 +48,13 @@ def test_a_trial_in_which_nothing_was_imagined_is_refused():
 
 @pytest.mark.parametrize("length", [6, 30])
 @pytest.mark.parametrize("refuted", [None, np.linspace(0, 1, CANDIDATES)])
-@pytest.mark.parametrize("success", [True, False])
-def test_a_picture_is_drawn_also_where_the_trial_ends_before_the_horizon(length, refuted, success, tmp_path):
+def test_a_picture_is_drawn_also_where_the_trial_ends_before_the_horizon(length, refuted, tmp_path):
     torch.manual_seed(0)
     foresight = {"horizon": 10, "num_samples": CANDIDATES}
     policy = UFRNNPolicy(network_config(foresight=foresight, recall={"enabled": False}, kernel="reference"))
     policy.joint_scaler.fit(torch.full((3,), -3.0), torch.full((3,), 3.0))
     policy.image_encoder.scaler.fit(torch.full((4,), -1.0), torch.full((4,), 1.0))
-    history = TrialHistory("pull", ("a", "b", "c"), success=success)
+    history = TrialHistory("pull", ("a", "b", "c"))
     for step in range(length):
         policy.select_action(observation(1))
         history.states.append(policy.memory.state)

@@ -87,32 +87,28 @@ def test_with_recall_what_is_imagined_is_kept_of_the_steps_that_surprised(datase
         assert imagined.chosen == event.chosen
 
 
-def test_a_film_shows_the_scene_before_the_first_step_and_after_each(dataset):
-    history = run_trial(trained(dataset, "none"), Playback(dataset, {}), seed=0, film=True)
-    assert [picture[0, 0, 0] for picture in history.film] == list(range(13))
-
-
-def test_the_steps_of_a_hold_and_the_tries_meanwhile_are_kept(dataset):
+@pytest.mark.parametrize("film", [False, True])
+def test_a_hold_and_the_tries_meanwhile_are_kept_and_the_scene_before_the_first_step_and_after_each(dataset, film):
     door = Playback(dataset, {2: "pull", 5: "push", 9: "pull"}, held=range(4, 8))
-    history = run_trial(trained(dataset, "none"), door, seed=0)
+    history = run_trial(trained(dataset, "none"), door, seed=0, film=film)
     assert history.held == [4, 5, 6, 7]
-    assert not history.film
     assert history.attempts == [Attempt(2, "pull"), Attempt(5, "push"), Attempt(9, "pull")]
+    assert [picture[0, 0, 0] for picture in history.film] == (list(range(13)) if film else [])
 
 
 @pytest.mark.parametrize(
-    ("attempts", "success", "first_try", "recovered"),
+    ("attempts", "success", "first_try", "recovered", "outcome"),
     [
-        ([], False, None, False),
-        (["pull"], True, 0, False),
-        (["push", "pull"], True, 0, True),
-        (["push", "pull"], False, 0, False),
+        ([], False, None, False, ("nothing", "not opened")),
+        (["pull"], True, 0, False, ("pull", "opened")),
+        (["push", "pull"], True, 0, True, ("push, pull", "opened")),
+        (["push", "pull"], False, 0, False, ("push, pull", "not opened")),
     ],
 )
-def test_a_recovery_opens_a_door_after_a_wrong_try(attempts, success, first_try, recovered):
+def test_a_recovery_opens_a_door_after_a_wrong_try(attempts, success, first_try, recovered, outcome):
     tries = [Attempt(step, way) for step, way in enumerate(attempts)]
     history = TrialHistory("pull", (), attempts=tries, success=success)
-    assert (history.first_try, history.recovered) == (first_try, recovered)
+    assert (history.first_try, history.recovered, history.outcome) == (first_try, recovered, outcome)
 
 
 def test_reading_a_demonstration_and_living_it_lead_to_the_same_states(dataset):

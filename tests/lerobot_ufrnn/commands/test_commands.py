@@ -16,16 +16,15 @@ from lerobot_ufrnn.commands.policies import read_provenance
 from lerobot_ufrnn.commands.results import ResultsConfig
 
 
-def test_help_names_every_command(capsys):
-    assert main(["--help"]) == 0
-    text = capsys.readouterr().out
-    assert all(f"\n  {name} " in text for name in COMMANDS)
-
-
-def test_help_of_all_commands_imports_none_of_them():
-    code = "import sys; from lerobot_ufrnn.commands import main; main(['--help']); print(*sys.modules)"
+def test_help_names_every_command_and_like_the_demo_while_its_stages_run_holds_nothing_heavy():
+    code = "import sys; from lerobot_ufrnn.commands import main; main(['--help']); print('loaded', *sys.modules)\n"
+    code += "import lerobot_ufrnn.commands.demo; print('loaded', *sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"torch", "lerobot", "mujoco", "gymnasium", "pandas"} & set(done.stdout.split())
+    text, *modules = done.stdout.split("loaded")
+    assert all(f"\n  {name} " in text for name in COMMANDS)
+    heavy = {"torch", "lerobot", "mujoco", "pandas", "matplotlib"}
+    assert not (heavy | {"gymnasium"}) & set(modules[0].split())
+    assert not heavy & set(modules[1].split())
 
 
 @pytest.mark.parametrize("command", COMMANDS)

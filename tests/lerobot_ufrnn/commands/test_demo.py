@@ -15,13 +15,6 @@ def test_what_the_demo_states_without_importing_it_is_true():
     assert Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR) == LAST_CHECKPOINT
 
 
-@pytest.mark.parametrize("module", ["lerobot_ufrnn.commands", "lerobot_ufrnn.commands.demo"])
-def test_while_the_stages_run_the_demo_itself_holds_nothing_heavy(module):
-    code = f"import sys, {module}; print(*sorted({{'torch', 'lerobot', 'pandas', 'matplotlib'}} & {{*sys.modules}}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "\n"
-
-
 def test_a_stage_that_fails_or_is_interrupted_ends_the_demo(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(RuntimeError, match="lerobot-train failed with exit status 1"):

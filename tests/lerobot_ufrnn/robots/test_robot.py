@@ -8,21 +8,22 @@ import numpy as np
 import pytest
 from lerobot.robots import make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from teleoperators_fakes import FEATURES
 from waiting import wait_until
 
 pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
 
-from env_door.env import DoorEnv
 from env_door.twin import TwinProcess
 from lerobot_ufrnn.robots.ur5e_robotiq import Fault, RobotFaultError, UR5eRobotiq, UR5eRobotiqConfig
 
 pytestmark = pytest.mark.real_time
 
-STILL = 0.01
-"""Joint speed in rad/s below which the arm stands."""
+STILL = 0.01  # rad/s of a joint below which the arm stands
+TURN = np.array([0, 0, 0, 0, 0, 0.05])  # a step of the last joint
 
-TURN = np.array([0, 0, 0, 0, 0, 0.05])
-"""A step of the last joint."""
+
+def make_robot(ip="127.1.250.250", **settings) -> UR5eRobotiq:
+    return make_robot_from_config(UR5eRobotiqConfig(ip=ip, id="test", image_size=0, **settings))
 
 
 @pytest.fixture
@@ -32,111 +33,86 @@ def twin():
 
 
 @pytest.fixture
-def connected(twin):
-    robots = []
+def robot(twin):
+    """Not connected yet."""
+    robot = make_robot(twin.address)
+    yield robot
+    if robot.is_connected:
+        robot.disconnect()
 
-    def connect(**settings) -> UR5eRobotiq:
-        settings = {"image_size": 0, **settings}
-        robots.append(UR5eRobotiq(UR5eRobotiqConfig(ip=twin.address, id="test", **settings)))
-        robots[-1].connect()
-        return robots[-1]
 
-    yield connect
-    for robot in robots:
-        if robot.is_connected:
-            robot.disconnect()
+@pytest.fixture
+def connected(robot):
+    robot.connect()
+    return robot
+
+
+def measured(robot: UR5eRobotiq) -> np.ndarray:
+    return joints_of(robot.get_observation())
 
 
 def joints_of(values: dict[str, float]) -> np.ndarray:
-    return np.array([value for name, value in values.items() if name != "gripper.pos"])
+    return np.array([values[name] for name in FEATURES[:-1]])
 
 
-def action_of(robot: UR5eRobotiq, joints: np.ndarray, gripper: float = 0.0) -> dict[str, float]:
-    return dict(zip(robot.action_features, [*joints.tolist(), gripper], strict=True))
+def action_of(joints: np.ndarray, gripper: float = 0.0) -> dict[str, float]:
+    return dict(zip(FEATURES, [*joints.tolist(), gripper], strict=True))
 
 
-def move(robot: UR5eRobotiq, change: np.ndarray, steps: int, gripper: float = 0.0) -> list[dict[str, float]]:
-    """Asks for a step of `change` at 10 Hz; what was sent."""
-    target = joints_of(robot.get_observation())
-    sent = []
+def move(robot: UR5eRobotiq, change: np.ndarray, steps: int, gripper: float = 0.0) -> np.ndarray:
+    """Asks for steps of `change` at 10 Hz; the joints that were sent last."""
+    target = measured(robot)
     for _ in range(steps):
         target = target + change
-        sent.append(robot.send_action(action_of(robot, target, gripper)))
+        sent = robot.send_action(action_of(target, gripper))
         time.sleep(0.1)
-    return sent
+    return joints_of(sent)
 
 
 def until_it_fails(robot: UR5eRobotiq) -> RobotFaultError:
     """Goes on asking for small movements until the robot refuses."""
-    try:
+    with pytest.raises(RobotFaultError) as told:
         wait_until(lambda: move(robot, 0.4 * TURN, 1) is None, 4.0)
-    except RobotFaultError as fault:
-        return fault
-    raise AssertionError("it never failed")
+    return told.value
 
 
-def speed_of(twin: TwinProcess) -> float:
-    return twin.state()["arm_speed"]
+def assert_still(twin: TwinProcess, after: float = 0.5) -> None:
+    time.sleep(after)
+    assert twin.state()["arm_speed"] < STILL
 
 
 # ── Use ───────────────────────────────────────────────────────────────
 
 
-def test_its_features_are_those_of_the_simulated_data_set():
-    robot = make_robot_from_config(UR5eRobotiqConfig(ip="127.1.250.250", id="test"))
-    env = DoorEnv()
-    names = [f"{name}.pos" for name in env.joint_names]
-    env.close()
-    assert list(robot.action_features) == names
-    assert list(robot.observation_features) == names
-    assert not robot.is_connected
-    with pytest.raises(DeviceNotConnectedError):
-        robot.get_observation()
-
-
 def test_it_holds_then_follows_and_then_rests_where_it_was_sent(twin, connected):
-    robot = connected()
     with pytest.raises(DeviceAlreadyConnectedError):
-        robot.connect()
-    start = joints_of(robot.get_observation())
+        connected.connect()
+    start = measured(connected)
     time.sleep(0.3)
-    np.testing.assert_allclose(joints_of(robot.get_observation()), start, atol=1e-3)
+    np.testing.assert_allclose(measured(connected), start, atol=1e-3)
     change = np.array([0.01, 0.0, -0.01, 0.0, 0.0, 0.03])
-    sent = move(robot, change, 10, gripper=0.6)
-    np.testing.assert_allclose(joints_of(sent[-1]), start + 10 * change, atol=1e-6)
-    time.sleep(1.0)
-    assert speed_of(twin) < STILL
-    now = robot.get_observation()
+    np.testing.assert_allclose(move(connected, change, 10, gripper=0.6), start + 10 * change, atol=1e-6)
+    assert_still(twin, after=1.0)
+    now = connected.get_observation()
     np.testing.assert_allclose(joints_of(now), start + 10 * change, atol=5e-3)
     assert now["gripper.pos"] == pytest.approx(0.6, abs=0.02)
-    robot.disconnect()
-    assert speed_of(twin) < STILL
-    assert not robot.is_connected
+    connected.disconnect()
+    assert_still(twin, after=0.0)
+    assert not connected.is_connected
 
 
-def test_a_jump_is_limited_and_what_was_sent_is_told(connected):
-    robot = connected()
-    start = joints_of(robot.get_observation())
-    sent = robot.send_action(action_of(robot, start + 1.0))
-    assert np.abs(joints_of(sent) - start).max() <= robot.config.command_limit + 1e-3
-    time.sleep(0.5)
-    assert np.abs(joints_of(robot.get_observation()) - start).max() <= robot.config.command_limit + 5e-3
-
-
-@pytest.mark.parametrize("broken", [float("nan"), None])
-def test_what_is_no_action_is_refused_and_the_arm_stays(connected, broken):
-    robot = connected()
-    start = joints_of(robot.get_observation())
-    action = action_of(robot, start + 0.05)
-    if broken is None:
-        del action["elbow.pos"], action["wrist_1.pos"], action["wrist_2.pos"]
-    else:
-        action["elbow.pos"] = broken
-    with pytest.raises(ValueError, match="nothing was sent"):
-        robot.send_action(action)
+def test_a_jump_is_limited_and_what_was_sent_is_told_and_what_is_no_action_is_refused(connected):
+    start = measured(connected)
+    action = action_of(start + 0.05)
+    for broken in (action | {"elbow.pos": float("nan")}, dict(list(action.items())[:4])):
+        with pytest.raises(ValueError, match="nothing was sent"):
+            connected.send_action(broken)
     time.sleep(0.3)
-    np.testing.assert_allclose(joints_of(robot.get_observation()), start, atol=1e-3)
-    move(robot, np.zeros(6), 1)  # and it goes on
+    np.testing.assert_allclose(measured(connected), start, atol=1e-3)
+    sent = connected.send_action(action_of(start + 1.0))  # and it goes on
+    assert np.abs(joints_of(sent) - start).max() <= connected.config.command_limit + 1e-3
+    time.sleep(0.5)
+    assert np.abs(measured(connected) - start).max() <= connected.config.command_limit + 5e-3
 
 
 # ── Faults ────────────────────────────────────────────────────────────
@@ -160,25 +136,23 @@ def test_what_is_no_action_is_refused_and_the_arm_stays(connected, broken):
     ],
 )
 def test_whatever_fails_stops_the_arm_and_leaves_it_stopped(twin, connected, name, parameters, fault):
-    robot = connected()
-    move(robot, TURN, 3)
+    move(connected, TURN, 3)
     twin.inject(name, **parameters)
-    told = until_it_fails(robot)
+    told = until_it_fails(connected)
     assert told.fault is fault
     assert "To go on: " in str(told)
-    time.sleep(0.5)
-    assert speed_of(twin) < STILL
+    assert_still(twin)
     twin.clear()
     joints = twin.state()["joints"]
     for _ in range(3):  # what has failed stays so, whatever is asked for
         with pytest.raises(RobotFaultError):
-            robot.send_action(action_of(robot, np.zeros(6)))
+            connected.send_action(action_of(np.zeros(6)))
         with pytest.raises(RobotFaultError):
-            robot.get_observation()
+            connected.get_observation()
         time.sleep(0.1)
     assert twin.state()["joints"] == pytest.approx(joints, abs=2e-3)
-    robot.disconnect()
-    assert not robot.is_connected
+    connected.disconnect()
+    assert not connected.is_connected
 
 
 @pytest.mark.slow
@@ -194,50 +168,46 @@ def test_whatever_fails_stops_the_arm_and_leaves_it_stopped(twin, connected, nam
         ("gripper_fault", Fault.GRIPPER_FAULT, "reports fault"),
     ],
 )
-def test_an_arm_that_is_not_ready_is_not_connected_to(twin, connected, name, fault, message):
+def test_an_arm_that_is_not_ready_is_not_connected_to(twin, robot, name, fault, message):
     twin.inject(name)
     with pytest.raises(RobotFaultError, match=message) as error:
-        connected()
+        robot.connect()
     assert error.value.fault is fault
-    assert speed_of(twin) < STILL
+    assert not robot.is_connected
+    assert_still(twin, after=0.0)
 
 
 def test_after_the_operator_has_looked_it_connects_again(twin, connected):
-    robot = connected()
     twin.inject("protective_stop")
-    until_it_fails(robot)
-    robot.disconnect()
+    until_it_fails(connected)
+    connected.disconnect()
     with pytest.raises(RobotFaultError, match="safety status"):
-        robot.connect()
-    assert not robot.is_connected
+        connected.connect()
+    assert not connected.is_connected
     twin.clear()
     pendant = importlib.import_module("dashboard_client").DashboardClient(twin.address)
     pendant.connect()
     pendant.unlockProtectiveStop()
     pendant.disconnect()
-    robot.connect()
-    move(robot, TURN, 1)
+    connected.connect()
+    move(connected, TURN, 1)
 
 
-def test_where_there_is_no_controller_it_says_so():
-    robot = UR5eRobotiq(UR5eRobotiqConfig(ip="127.1.250.250", id="test"))
+def test_without_a_controller_or_its_client_it_says_what_is_missing(monkeypatch):
+    robot = make_robot()
     with pytest.raises(RobotFaultError, match=r"no controller answers at 127\.1\.250\.250"):
         robot.connect()
     assert not robot.is_connected
-
-
-def test_without_the_client_library_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "rtde_control", None)
-    robot = UR5eRobotiq(UR5eRobotiqConfig(ip="127.1.250.250", id="test"))
     with pytest.raises(ImportError, match=r"needs ur_rtde.*lerobot_policy_ufrnn\[ur5e\]"):
         robot.connect()
     assert not robot.is_connected
+    with pytest.raises(DeviceNotConnectedError):
+        robot.get_observation()
 
 
 def test_if_the_servo_process_is_killed_the_watchdog_stops_the_arm(twin, connected):
-    robot = connected()
-    move(robot, TURN, 2)
-    robot._servo._process.kill()
-    assert until_it_fails(robot).fault is Fault.SERVO_DIED
-    time.sleep(0.5)
-    assert speed_of(twin) < STILL
+    move(connected, TURN, 2)
+    connected._servo._process.kill()
+    assert until_it_fails(connected).fault is Fault.SERVO_DIED
+    assert_still(twin)

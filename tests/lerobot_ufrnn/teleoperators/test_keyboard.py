@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from lerobot.utils import keyboard_input
 
-from lerobot_ufrnn.teleoperators import DeviceLostError, DeviceUnavailableError, keyboard
+from lerobot_ufrnn.teleoperators import keyboard
+from lerobot_ufrnn.teleoperators.device import DeviceLostError, DeviceUnavailableError
 from lerobot_ufrnn.teleoperators.keyboard import AXES, GRIPPER, KeyboardDevice
 
 SHIFT = SimpleNamespace(name="shift_r")
@@ -29,7 +30,7 @@ class FakeListener:
 @pytest.fixture
 def desktop(monkeypatch):
     """A desktop with pynput; tests change what it allows."""
-    desktop = SimpleNamespace(installed=True, captures=True, trusted=True)
+    desktop = SimpleNamespace(captures=True, trusted=True)
     monkeypatch.setitem(sys.modules, "pynput", SimpleNamespace(keyboard=SimpleNamespace(Listener=FakeListener)))
     monkeypatch.setattr(keyboard, "pynput_can_capture", lambda: desktop.captures)
     monkeypatch.setattr(keyboard, "pynput_listener_is_trusted", lambda _: desktop.trusted)
@@ -50,28 +51,25 @@ def char(letter):
 
 
 @pytest.mark.parametrize(
-    ("keys", "twist"),
+    ("keys", "twist", "buttons"),
     [
-        ("", [0, 0, 0, 0, 0, 0]),
-        ("w", [1, 0, 0, 0, 0, 0]),
-        ("sd", [-1, -1, 0, 0, 0, 0]),
-        ("ws", [0, 0, 0, 0, 0, 0]),
-        ("ae", [0, 1, 1, 0, 0, 0]),
-        ("okj", [0, 0, 0, 1, -1, 1]),
-        ("cuil", [0, 0, -1, -1, 1, -1]),
+        ("", [0, 0, 0, 0, 0, 0], set()),
+        ("w", [1, 0, 0, 0, 0, 0], set()),
+        ("sd", [-1, -1, 0, 0, 0, 0], set()),
+        ("ws", [0, 0, 0, 0, 0, 0], set()),
+        ("ae", [0, 1, 1, 0, 0, 0], set()),
+        ("okj", [0, 0, 0, 1, -1, 1], set()),
+        ("cuil", [0, 0, -1, -1, 1, -1], set()),
+        ("g", [0, 0, 0, 0, 0, 0], {"close"}),
+        ("gh", [0, 0, 0, 0, 0, 0], {"open", "close"}),
     ],
 )
-def test_keys_are_axes_in_the_body_convention_of_ros(device, keys, twist):
+def test_keys_are_axes_in_the_body_convention_of_ros_and_buttons(device, keys, twist, buttons):
     for key in (SHIFT, *map(char, keys.upper())):  # as Shift makes them
         device._listener.press(key)
-    np.testing.assert_array_equal(device.read().twist, twist)
-
-
-@pytest.mark.parametrize(("keys", "buttons"), [("G", {"close"}), ("GH", {"open", "close"})])
-def test_gripper_keys_are_buttons(device, keys, buttons):
-    for key in (SHIFT, *map(char, keys)):
-        device._listener.press(key)
-    assert device.read().buttons == buttons
+    state = device.read()
+    np.testing.assert_array_equal(state.twist, twist)
+    assert state.buttons == buttons
 
 
 def test_keys_count_while_they_are_held_and_only_with_shift(device):
@@ -83,8 +81,8 @@ def test_keys_count_while_they_are_held_and_only_with_shift(device):
     assert twist() == [0, 0]
     listener.press(SHIFT)
     listener.press(char("A"))
-    listener.press(char("x"))  # means nothing
-    listener.press(SimpleNamespace(name="esc"))
+    for meaningless in (char("x"), char(None), SimpleNamespace(name="esc"), None):
+        listener.press(meaningless)
     assert twist() == [1, 1]
     listener.release(char("W"))
     assert twist() == [0, 1]
@@ -108,7 +106,7 @@ def test_a_listener_that_ends_is_told(device):
 )
 def test_where_pynput_cannot_run_it_says_what_to_do(desktop, monkeypatch, lacks, remedy):
     setattr(desktop, lacks, False)
-    monkeypatch.setattr(keyboard, "_pynput_available", desktop.installed)
+    monkeypatch.setattr(keyboard, "_pynput_available", lacks != "installed")
     device = KeyboardDevice()
     with pytest.raises(DeviceUnavailableError, match=remedy):
         device.open()

@@ -1,3 +1,4 @@
+import contextlib
 import sys
 import time
 from types import SimpleNamespace
@@ -7,7 +8,8 @@ import pytest
 from teleoperators_fakes import Clock
 from waiting import wait_until
 
-from lerobot_ufrnn.teleoperators import DeviceLostError, DeviceUnavailableError, SpaceMouseTwistConfig
+from lerobot_ufrnn.teleoperators import SpaceMouseTwistConfig
+from lerobot_ufrnn.teleoperators.device import DeviceLostError, DeviceUnavailableError
 from lerobot_ufrnn.teleoperators.spacemouse import SpaceMouseDevice
 
 
@@ -15,10 +17,9 @@ def make_device(clock=time.monotonic, **settings):
     return SpaceMouseDevice(SpaceMouseTwistConfig(robot_ip="192.0.2.1", **settings), clock)
 
 
-def report(t, twist=(0, 0, 0, 0, 0, 0), buttons=(0, 0)):
+def report(t, x=0, y=0, z=0, roll=0, pitch=0, yaw=0, buttons=(0, 0)):
     """What the mouse says; `t` tells a new report from an old one."""
-    axes = dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), twist, strict=True))
-    return SimpleNamespace(t=t, buttons=list(buttons), **axes)
+    return SimpleNamespace(t=t, x=x, y=y, z=z, roll=roll, pitch=pitch, yaw=yaw, buttons=list(buttons))
 
 
 class FakeLibrary:
@@ -51,13 +52,8 @@ def mouse(monkeypatch):
 
 
 @pytest.fixture
-def clock():
-    return Clock()
-
-
-@pytest.fixture
-def device(mouse, clock):
-    device = make_device(clock, deadzone=0.2)
+def device(mouse):
+    device = make_device(Clock(), deadzone=0.2)
     device.open()
     yield device
     device.close()
@@ -67,27 +63,27 @@ def device(mouse, clock):
 def test_the_axes_of_ros_are_asked_for_and_small_deflections_are_none(device, mouse):
     assert mouse.asked == ["ros"]
     assert not device.read().twist.any()
-    mouse.report = report(1.0, (0.6, -0.2, 0.1, 1.2, -1.0, 0.0))
+    mouse.report = report(1.0, 0.6, -0.2, 0.1, 1.2, -1.0)
     wait_until(lambda: device.read().twist.any())
     np.testing.assert_allclose(device.read().twist, [0.5, 0, 0, 1, -1, 0], atol=1e-12)
 
 
-def test_a_deflection_that_is_not_repeated_fades_but_a_button_stays(device, mouse, clock):
-    mouse.report = report(1.0, (1, 0, 0, 0, 0, 0), (1, 0))
+def test_a_deflection_that_is_not_repeated_fades_but_a_button_stays(device, mouse):
+    mouse.report = report(1.0, x=1, buttons=(1, 0))
     wait_until(lambda: device.read().twist.any())
-    clock.now += 0.19
+    device._clock.now += 0.19
     assert device.read().twist[0] == 1
-    clock.now += 0.02
+    device._clock.now += 0.02
     state = device.read()
     assert not state.twist.any()
     assert state.buttons == {"close"}
-    mouse.report = report(2.0, (1, 0, 0, 0, 0, 0), (0, 1))
+    mouse.report = report(2.0, x=1, buttons=(0, 1))
     wait_until(lambda: device.read().buttons == {"open"})
     assert device.read().twist[0] == 1
 
 
 def test_a_value_that_is_no_number_is_passed_on_to_be_seen(device, mouse):
-    mouse.report = report(1.0, (float("nan"), 0, 0, 0, 0, 0))
+    mouse.report = report(1.0, x=float("nan"))
     wait_until(lambda: device.read().fault() is not None)
 
 
@@ -103,6 +99,7 @@ def test_an_unplugged_mouse_is_told(device, mouse):
         (RuntimeError("HID API is probably not installed."), "libhidapi-hidraw0"),
         (RuntimeError("Failed to open device"), "udev"),
         (RuntimeError("No connected or supported devices found."), "plug one in"),
+        (OSError("cannot load library"), "libhidapi-hidraw0"),
     ],
 )
 def test_what_is_missing_is_told_with_its_remedy(mouse, fault, remedy):
@@ -125,18 +122,11 @@ class FakeHid:
 
     def __init__(self, *reports):
         self.reports = [bytes(report) for report in reports]
-
-    def open(self):
-        pass
-
-    def set_nonblocking(self, _):
-        pass
+        self.open = self.close = lambda: None
+        self.set_nonblocking = lambda _: None
 
     def read(self, _):
         return self.reports.pop(0) if self.reports else b""
-
-    def close(self):
-        pass
 
 
 def words(channel, *values):
@@ -158,17 +148,10 @@ def words(channel, *values):
 )
 def test_raw_reports_become_axes_of_ros_in_the_real_library(monkeypatch, raw, axis, direction):
     pyspacemouse = pytest.importorskip("pyspacemouse", reason="needs the extra `spacemouse`")
-    from pyspacemouse import api
-
     hid = FakeHid(raw, [3, 2, 0, 0, 0, 0, 0])
     hid.vendor_id, hid.product_id = pyspacemouse.get_device_specs()["SpaceMouseCompact"].hid_id
-    monkeypatch.setattr(api, "Enumeration", lambda: SimpleNamespace(find=lambda: [hid]))
-    device = make_device(deadzone=0.0, stale_after=1.0)
-    device.open()
-    try:
+    monkeypatch.setattr(pyspacemouse.api, "Enumeration", lambda: SimpleNamespace(find=lambda: [hid]))
+    with contextlib.closing(make_device(deadzone=0.0, stale_after=1.0)) as device:
+        device.open()
         wait_until(lambda: device.read().buttons == {"open"})
-        expected = np.zeros(6)
-        expected[axis] = direction
-        np.testing.assert_allclose(device.read().twist, expected, atol=1e-12)
-    finally:
-        device.close()
+        np.testing.assert_allclose(device.read().twist, direction * np.eye(6)[axis], atol=1e-12)

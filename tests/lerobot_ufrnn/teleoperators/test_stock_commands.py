@@ -2,7 +2,6 @@
 
 import json
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,64 +19,65 @@ from lerobot_ufrnn.teleoperators import SpaceMouseTwistConfig, twist_teleoperato
 STEPS, PERIOD = 40, 0.1
 
 
-def write(path, events):
-    path.write_text("".join(json.dumps(event) + "\n" for event in events))
+def write(path, *events):
+    """Events as (time, twist, buttons)."""
+    lines = (json.dumps({"time": time, "twist": twist, "buttons": buttons}) for time, twist, *buttons in events)
+    path.write_text("\n".join(lines))
     return path
 
 
-class FakeServo:
-    """An arm that is at once where it is sent; a period passes with each target."""
+class World:
+    """The arm, and in place of the robot's servo what brings it at once where it is sent; a period passes with each."""
 
     fault = None
 
-    def __init__(self, world):
-        self.world = world
+    def __init__(self):
+        self.arm, self.clock, self.sent, self.leads, self.order = fakes.FakeArmState(), fakes.Clock(), [], [], []
+        self.controls = {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
+
+    def open(self):
+        self.order.append("teleoperator connected")
+        self.arm.is_open = True
 
     def start(self):
-        self.world.order.append("robot connected")
+        self.order.append("robot connected")
 
     def stop(self):
-        self.world.order.append("robot disconnected")
+        self.order.append("robot disconnected")
 
     def read(self):
-        return self.world.arm.measured, self.world.arm.measured
+        return self.arm.measured, self.arm.measured
 
     def move_to(self, target):
-        self.world.leads.append(np.abs(target - self.world.arm.measured).max())
-        self.world.sent.append(target)
-        self.world.arm.measured = target
-        self.world.clock.now += PERIOD
-        self.world.controls["exit_early"] = len(self.world.sent) == STEPS
+        self.leads.append(np.abs(target - self.arm.measured).max())
+        self.sent.append(target)
+        self.arm.measured = target
+        self.clock.now += PERIOD
+        self.controls["exit_early"] = len(self.sent) == STEPS
 
 
 @pytest.fixture
 def world(monkeypatch):
-    """The robot with a fake servo, and what happens to it."""
-    world = SimpleNamespace(arm=fakes.FakeArmState(), clock=fakes.Clock(), sent=[], leads=[], order=[])
-    world.controls = {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
-
-    def connect_arm(*_):
-        world.order.append("teleoperator connected")
-        return world.arm
-
-    monkeypatch.setattr(twist_teleoperator, "ArmState", connect_arm)
+    world = World()
+    monkeypatch.setattr(world.arm, "open", world.open)
+    monkeypatch.setattr(twist_teleoperator, "ArmState", lambda *_: world.arm)
     monkeypatch.setattr(twist_teleoperator, "monotonic", world.clock)
     monkeypatch.setattr(lerobot_record, "init_keyboard_listener", lambda: (None, world.controls))
-    monkeypatch.setattr(robot, "Servo", lambda _: FakeServo(world))
+    monkeypatch.setattr(robot, "Servo", lambda _: world)
     monkeypatch.setattr(robot.UR5eRobotiq, "_check_ready", lambda _: None)
     return world
 
 
 def test_lerobot_record_writes_what_the_robot_was_sent(world, tmp_path):
     # Changes lie between the periods: each state lasts for a whole number of them.
-    events = [
-        {"time": 0.0, "twist": [0, 0, 0, 0, 0, 0]},
-        {"time": 0.05, "twist": [0, 0, 0.5, 0, 0, 0]},
-        {"time": 1.05, "twist": [0, 0, 0, 0.6, 0, 0]},
-        {"time": 2.05, "twist": [0, 0, 0, 0, 0, 0], "buttons": ["close"]},
-        {"time": 2.55, "twist": [0, 0, 0, 0, 0, 0]},
-    ]
-    device = write(tmp_path / "events.jsonl", events)
+    device = write(
+        tmp_path / "events.jsonl",
+        (0.0, [0, 0, 0, 0, 0, 0]),
+        (0.05, [0, 0, 0.5, 0, 0, 0]),
+        (1.05, [0, 0, 0, 0.6, 0, 0]),
+        (2.05, [0, 0, 0, 0, 0, 0], "close"),
+        (2.55, [0, 0, 0, 0, 0, 0]),
+    )
     lerobot_record.record(
         lerobot_record.RecordConfig(
             robot=UR5eRobotiqConfig(ip="192.0.2.1", gripper_port=0, calibration_dir=tmp_path),
@@ -118,15 +118,16 @@ def test_lerobot_record_writes_what_the_robot_was_sent(world, tmp_path):
 def test_lerobot_teleoperate_moves_the_twin_along_and_nothing_else(tmp_path, monkeypatch):
     """The real client of the controller, the robot and its twin: nothing stands in for anything here."""
     pytest.importorskip("rtde_control", reason="needs the extra `ur5e`")
-    from env_door.twin import TwinProcess, free_address
+    from env_door.twin import TwinProcess
 
-    events = [
-        {"time": 0.0, "twist": [0, 0, 0, 0, 0, 0]},
-        {"time": 0.5, "twist": [-0.6, 0, 0, 0, 0, 0]},
-        {"time": 1.3, "twist": [0, 0, 0.6, 0, 0, 0], "buttons": ["close"]},
-        {"time": 2.1, "twist": [0, 0, 0, 0, 0, 0]},
-    ]
-    with TwinProcess(address=free_address(), kind="push", seed=3) as twin:
+    device = write(
+        tmp_path / "events.jsonl",
+        (0.0, [0, 0, 0, 0, 0, 0]),
+        (0.5, [-0.6, 0, 0, 0, 0, 0]),
+        (1.3, [0, 0, 0.6, 0, 0, 0], "close"),
+        (2.1, [0, 0, 0, 0, 0, 0]),
+    )
+    with TwinProcess(kind="push", seed=3) as twin:
         before = twin.state()["joints"]
         flags = [
             "--robot.type=ur5e_robotiq",
@@ -134,7 +135,7 @@ def test_lerobot_teleoperate_moves_the_twin_along_and_nothing_else(tmp_path, mon
             f"--robot.calibration_dir={tmp_path}",
             "--teleop.type=spacemouse_twist",
             f"--teleop.robot_ip={twin.address}",
-            f"--teleop.device={write(tmp_path / 'events.jsonl', events)}",
+            f"--teleop.device={device}",
             f"--teleop.calibration_dir={tmp_path}",
             "--fps=10",
             "--teleop_time_s=3",

@@ -3,7 +3,6 @@ import pytest
 import teleoperators_fakes as fakes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from lerobot_ufrnn.teleoperators import SpaceMouseTwistConfig
 from lerobot_ufrnn.teleoperators.tool_target import Hindrance, ToolTarget
@@ -24,19 +23,6 @@ def drive(target, twist, steps, seconds=0.1, start=fakes.READY, follow=True):
     return joints
 
 
-@pytest.mark.parametrize("axis", range(6))
-@pytest.mark.parametrize("direction", [-1.0, 1.0])
-def test_each_axis_moves_the_tool_along_or_about_itself_and_nothing_else(axis, direction):
-    twist = np.zeros(6)
-    twist[axis] = direction * (0.05 if axis < 3 else 0.3)
-    joints = drive(make_target(), twist, 10)
-    start, start_rotation = fakes.tool_pose(fakes.READY)
-    position, rotation = fakes.tool_pose(joints)
-    np.testing.assert_allclose(position, start + twist[:3], atol=5e-5)
-    expected = Rotation.from_rotvec(twist[3:]) * start_rotation
-    assert (rotation * expected.inv()).magnitude() < 5e-4
-
-
 def test_at_rest_the_target_is_the_start_for_ever():
     np.testing.assert_array_equal(drive(make_target(), np.zeros(6), 1000), fakes.READY)
 
@@ -54,17 +40,19 @@ def test_going_there_and_back_leads_back_without_drift():
 @given(
     twists=st.lists(st.tuples(*[st.floats(-0.5, 0.5)] * 3, *[st.floats(-2, 2)] * 3), min_size=1, max_size=12),
     lags=st.lists(st.floats(0.0, 1.0), min_size=12, max_size=12),
+    kicks=st.lists(st.sampled_from([0.0, 0.0, 0.3, -0.8]), min_size=12, max_size=12),
     seconds=st.floats(0.001, 0.25),
 )
-def test_no_target_leaves_the_lead_or_is_too_fast_whatever_the_arm_does(twists, lags, seconds):
+def test_no_target_leaves_the_lead_or_is_too_fast_whatever_the_arm_does(twists, lags, kicks, seconds):
     target = make_target(joint_speed=0.6, max_lead=0.07)
     measured = fakes.READY.copy()
     before = target.start(measured)
-    for twist, lag in zip(twists, lags, strict=False):
+    for twist, lag, kick in zip(twists, lags, kicks, strict=False):
+        measured = measured + kick  # by somebody else, after whom the target goes at once
         joints = target.step(np.array(twist), seconds, measured)
         assert np.isfinite(joints).all()
         assert np.abs(joints - measured).max() <= 0.07 + 1e-12
-        assert np.abs(joints - before).max() <= 0.6 * seconds + 1e-9
+        assert kick or np.abs(joints - before).max() <= 0.6 * seconds + 1e-9
         before, measured = joints, measured + lag * (joints - measured)
 
 

@@ -1,5 +1,3 @@
-import logging
-
 import numpy as np
 import pytest
 import teleoperators_fakes as fakes
@@ -7,77 +5,87 @@ from lerobot.teleoperators import TeleoperatorConfig, make_teleoperator_from_con
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from env_door.env import GRASP_ROTATION
-from lerobot_ufrnn.teleoperators import (
-    ArmStateError,
-    DeviceLostError,
-    DeviceState,
-    DeviceUnavailableError,
-    KeyboardTwist,
-    KeyboardTwistConfig,
-    SpaceMouseTwist,
-    SpaceMouseTwistConfig,
-    twist_teleoperator,
-)
+from lerobot_ufrnn.teleoperators import KeyboardTwist, SpaceMouseTwist, SpaceMouseTwistConfig, twist_teleoperator
+from lerobot_ufrnn.teleoperators.arm_state import ArmStateError
+from lerobot_ufrnn.teleoperators.device import DeviceLostError, DeviceState, DeviceUnavailableError
 
 AHEAD = np.array([1.0, 0, 0, 0, 0, 0])
 
 
+class ScriptedDevice:
+    """Gives what a test put into `state`; whatever is asked of it fails with `fault`, if there is one."""
+
+    def __init__(self):
+        self.state, self.is_open, self.fault = DeviceState(), False, None
+
+    def open(self):
+        self._fail()
+        self.is_open = True
+
+    def read(self):
+        self._fail()
+        return self.state
+
+    def close(self):
+        self.is_open = False
+        self._fail()
+
+    def _fail(self):
+        if self.fault is not None:
+            raise self.fault
+
+
+class Rig:
+    """A teleoperator with a device, an arm and a clock that the test moves."""
+
+    def __init__(self, folder):
+        self.arm, self.clock, self.device = fakes.FakeArmState(), fakes.Clock(), ScriptedDevice()
+        self._folder = folder
+
+    def connect(self, **fields):
+        config = SpaceMouseTwistConfig(robot_ip="192.0.2.1", calibration_dir=self._folder, **fields)
+        self.teleop = make_teleoperator_from_config(config)
+        self.teleop.connect()
+        return self.teleop
+
+    def start(self, **fields):
+        """Connects and asks for the first action."""
+        self.connect(**fields)
+        return self.tick()
+
+    def tick(self, twist=None, buttons=(), seconds=0.1, follow=True):
+        """One action after some seconds; the arm is there at once."""
+        self.clock.now += seconds
+        if twist is not None:
+            self.device.state = DeviceState(np.array(twist, dtype=np.float64), frozenset(buttons))
+        action = self.teleop.get_action()
+        joints = np.array([action[name] for name in fakes.FEATURES[:-1]])
+        if follow:
+            self.arm.measured = joints
+        return joints, action["gripper.pos"]
+
+
 @pytest.fixture
 def rig(monkeypatch, tmp_path):
-    """A connected teleoperator with a device, an arm and a clock that the test moves."""
-
-    class Rig:
-        def __init__(self):
-            self.arm, self.clock, self.device = fakes.FakeArmState(), fakes.Clock(), fakes.ScriptedDevice()
-            monkeypatch.setattr(twist_teleoperator, "ArmState", lambda *_: self.arm)
-            monkeypatch.setattr(twist_teleoperator, "monotonic", self.clock)
-            monkeypatch.setattr(SpaceMouseTwist, "make_own_device", lambda _: self.device)
-
-        def connect(self, **fields):
-            config = SpaceMouseTwistConfig(robot_ip="192.0.2.1", calibration_dir=tmp_path, **fields)
-            self.teleop = make_teleoperator_from_config(config)
-            self.teleop.connect()
-            return self.teleop
-
-        def start(self, **fields):
-            """Connects and asks for the first action."""
-            self.connect(**fields)
-            return self.tick()
-
-        def tick(self, twist=None, buttons=(), seconds=0.1, follow=True):
-            """One action after some seconds; the arm is there at once."""
-            self.clock.now += seconds
-            if twist is not None:
-                self.device.state = DeviceState(np.array(twist, dtype=np.float64), frozenset(buttons))
-            action = self.teleop.get_action()
-            joints = np.array([action[name] for name in fakes.FEATURES[:-1]])
-            if follow:
-                self.arm.measured = joints
-            return joints, action["gripper.pos"]
-
-    return Rig()
+    rig = Rig(tmp_path)
+    monkeypatch.setattr(twist_teleoperator, "ArmState", lambda *_: rig.arm)
+    monkeypatch.setattr(twist_teleoperator, "monotonic", rig.clock)
+    monkeypatch.setattr(SpaceMouseTwist, "make_own_device", lambda _: rig.device)
+    return rig
 
 
-@pytest.mark.parametrize(
-    ("config_class", "kind", "name"),
-    [
-        (SpaceMouseTwistConfig, SpaceMouseTwist, "spacemouse_twist"),
-        (KeyboardTwistConfig, KeyboardTwist, "keyboard_twist"),
-    ],
-)
-def test_lerobot_makes_both_from_their_configurations(tmp_path, config_class, kind, name):
-    assert TeleoperatorConfig.get_choice_class(name) is config_class
+@pytest.mark.parametrize("kind", [SpaceMouseTwist, KeyboardTwist])
+def test_lerobot_makes_both_from_their_configurations(tmp_path, kind):
+    config_class = TeleoperatorConfig.get_choice_class(kind.name)
     teleop = make_teleoperator_from_config(config_class(robot_ip="192.0.2.1", calibration_dir=tmp_path))
-    assert isinstance(teleop, kind)
-    assert teleop.name == teleop.config.type == name
+    assert type(teleop) is kind
+    assert teleop.config.type == teleop.name == kind.name in ("spacemouse_twist", "keyboard_twist")
     assert list(teleop.action_features) == fakes.FEATURES
     assert (teleop.feedback_features, teleop.is_calibrated, teleop.is_connected) == ({}, True, False)
 
 
-@pytest.mark.parametrize(
-    "joints", [fakes.READY, fakes.READY + 0.2, np.array([0.3, -1.2, 1.9, -0.5, -1.5, 3.0])], ids=["ready", "off", "far"]
-)
 @pytest.mark.parametrize("gripper", [0.0, 0.62])
+@pytest.mark.parametrize("joints", [fakes.READY, fakes.READY + 0.2, [0.3, -1.2, 1.9, -0.5, -1.5, 3.0]])
 def test_the_first_action_is_where_the_arm_is_whatever_the_device_says(rig, joints, gripper):
     rig.connect()
     # As late as the robot needs to connect, and perhaps to be moved by hand, after the teleoperator did.
@@ -85,14 +93,6 @@ def test_the_first_action_is_where_the_arm_is_whatever_the_device_says(rig, join
     action, closure = rig.tick(np.ones(6), ["close"], seconds=20)
     np.testing.assert_array_equal(action, joints)
     assert closure == gripper
-
-
-def test_every_later_action_is_near_the_arm_even_if_it_was_moved_meanwhile(rig):
-    rig.start(max_lead=0.05)
-    for offset in (0.3, -0.8, 0.1):
-        rig.arm.measured = rig.arm.measured + offset
-        joints, _ = rig.tick(np.ones(6), follow=False)
-        assert np.abs(joints - rig.arm.measured).max() <= 0.05 + 1e-12
 
 
 def test_after_a_pause_it_starts_from_where_the_arm_is(rig):
@@ -123,18 +123,20 @@ def test_speeds_are_those_of_the_configuration_at_any_rate_and_over_deflection_i
     np.testing.assert_allclose(turned.as_rotvec(), [0, 0, -0.2 * 0.5], atol=3e-4)
 
 
-@pytest.mark.parametrize("twist", np.eye(6).tolist(), ids=["ahead", "left", "up", "roll", "pitch", "yaw"])
-def test_in_the_frame_of_the_tool_axes_turn_with_the_gripper(rig, twist):
-    rig.start(frame="tool", linear_speed=0.05, angular_speed=0.2)
+@pytest.mark.parametrize("frame", ["base", "tool"])
+@pytest.mark.parametrize("twist", [*np.eye(6), *-np.eye(6)])
+def test_each_axis_moves_the_tool_along_or_about_itself_and_nothing_else(rig, frame, twist):
+    rig.start(frame=frame, linear_speed=0.05, angular_speed=0.3)
     start, start_rotation = fakes.tool_pose(rig.arm.measured)
-    joints, _ = rig.tick(twist)
-    position, rotation = fakes.tool_pose(joints)
-    # The tool's own axes: z ahead, y to the right, x up.
-    x, y, z = start_rotation.as_matrix().T
-    axis = np.stack([z, -y, x]).T @ (np.array(twist[:3]) + np.array(twist[3:]))
-    np.testing.assert_allclose(position - start, axis * 0.005 * any(twist[:3]), atol=2e-5)
-    turned = (rotation * start_rotation.inv()).as_rotvec()
-    np.testing.assert_allclose(turned, axis * 0.02 * any(twist[3:]), atol=2e-4)
+    for count in range(1, 11):
+        joints, _ = rig.tick(twist)
+        position, rotation = fakes.tool_pose(joints)
+        # The tool's own axes: z ahead, y to the right, x up.
+        x, y, z = start_rotation.as_matrix().T
+        axis = (np.stack([z, -y, x]).T if frame == "tool" else np.eye(3)) @ (twist[:3] + twist[3:])
+        np.testing.assert_allclose(position - start, axis * 0.005 * count * any(twist[:3]), atol=5e-5)
+        turned = (rotation * start_rotation.inv()).as_rotvec()
+        np.testing.assert_allclose(turned, axis * 0.03 * count * any(twist[3:]), atol=5e-4)
 
 
 def test_with_the_gripper_level_both_frames_are_one():
@@ -149,72 +151,48 @@ def test_buttons_move_the_gripper_while_they_are_held(rig):
     assert rig.tick(np.zeros(6), ["open", "close"])[1] == pytest.approx(0.6)
 
 
-@pytest.mark.parametrize(
-    "state",
-    [
-        DeviceState(np.array([np.nan, 0, 0, 0, 0, 0])),
-        DeviceState(np.array([np.inf, 0, 0, 0, 0, 0])),
-        DeviceState(np.ones(5)),
-        DeviceState(np.ones(6), frozenset({"fire"})),
-    ],
-    ids=["nan", "inf", "shape", "button"],
-)
-def test_nonsense_from_the_device_holds_the_arm_and_is_told_once(rig, caplog, state):
+def test_nonsense_from_the_device_holds_the_arm_and_is_told_once(rig, caplog):
     rig.start()
-    rig.device.state = state
-    with caplog.at_level(logging.WARNING):
-        for _ in range(10):
-            joints, closure = rig.tick()
+    for nonsense in ([np.nan, 0, 0, 0, 0, 0], [np.inf, 0, 0, 0, 0, 0], np.ones(5)):
+        for _ in range(5):
+            joints, closure = rig.tick(nonsense, ["close"])
             np.testing.assert_array_equal(joints, fakes.READY)
             assert closure == 0.0
-    assert len(caplog.records) == 1
-    assert "The arm holds" in caplog.text
+    assert ["The arm holds" in message for message in caplog.messages] == [True]
     joints, _ = rig.tick(AHEAD)
     assert (joints != fakes.READY).any()
 
 
 def test_a_hindrance_is_told_once_and_again_after_it_was_over(rig, caplog):
     rig.start()
-    with caplog.at_level(logging.WARNING):
-        for _ in range(50):
-            rig.tick(AHEAD, follow=False)
-        assert [record.message for record in caplog.records if "does not follow" in record.message] != []
-        assert len(caplog.records) == 1
-        for _ in range(25):
-            rig.tick(np.zeros(6), follow=False)
-        for _ in range(10):
-            rig.tick(AHEAD, follow=False)
-    assert len(caplog.records) == 2
+    for _ in range(50):
+        rig.tick(AHEAD, follow=False)
+    assert ["does not follow" in message for message in caplog.messages] == [True]
+    for _ in range(25):
+        rig.tick(np.zeros(6), follow=False)
+    for _ in range(10):
+        rig.tick(AHEAD, follow=False)
+    assert len(caplog.messages) == 2
 
 
-def test_a_lost_device_or_an_arm_that_nobody_knows_of_ends_it_and_disconnecting_still_works(rig):
+def test_a_lost_device_or_arm_ends_it_and_disconnecting_does_not_fail_so_that_the_robot_is_stopped_next(rig):
     teleop = rig.connect()
     rig.tick()
-    rig.device.state = DeviceLostError("gone")
+    rig.device.fault = DeviceLostError("gone")
     with pytest.raises(DeviceLostError, match="gone"):
         rig.tick()
     rig.arm.fault = ArmStateError("nobody knows")
     with pytest.raises(ArmStateError, match="nobody knows"):
         rig.tick()
     teleop.disconnect()
-    assert not rig.device.is_open
-    assert not rig.arm.is_open
-
-
-def test_disconnecting_does_not_fail_so_that_the_robot_is_stopped_next(rig):
-    teleop = rig.connect()
-    rig.device.close = lambda: fakes.fail(OSError("stuck"))
-    teleop.disconnect()
-    assert not teleop.is_connected
-    assert not rig.arm.is_open
+    assert (teleop.is_connected, rig.device.is_open, rig.arm.is_open) == (False, False, False)
 
 
 def test_a_device_that_cannot_be_opened_leaves_nothing_open(rig):
-    rig.device.open = lambda: fakes.fail(DeviceUnavailableError("not plugged in"))
+    rig.device.fault = DeviceUnavailableError("not plugged in")
     with pytest.raises(DeviceUnavailableError, match="not plugged in"):
         rig.connect()
-    assert not rig.teleop.is_connected
-    assert not rig.arm.is_open
+    assert (rig.teleop.is_connected, rig.arm.is_open) == (False, False)
 
 
 def test_it_wants_to_be_connected_once(rig):

@@ -1,8 +1,7 @@
 import pytest
 from teleoperators_fakes import Clock
 
-from lerobot_ufrnn.teleoperators import DeviceUnavailableError
-from lerobot_ufrnn.teleoperators.events import EventStreamDevice
+from lerobot_ufrnn.teleoperators.device import DeviceUnavailableError, EventStreamDevice
 
 
 def test_each_state_lasts_until_the_next_and_the_end_is_at_rest(tmp_path):

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from env_door.twin.motion import MAX_ACCELERATION, TIME_STEP, JointMotion
+from env_door.twin.arm import MAX_ACCELERATION, TIME_STEP, JointMotion
 
 
 def motion(start=0.0, speed=3.0):
