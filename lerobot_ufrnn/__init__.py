@@ -18,6 +18,7 @@ _MODULES = {
     "processor_ufrnn": ("make_ufrnn_pre_post_processors",),
     "networks": ("SHLSTM", "HiddenState", "Prediction"),
     "foresight": ("UFRNN", "Foresight", "ForesightTrace", "perturb", "roll_out", "select"),
+    "demonstrations": ("Demonstrations",),
     "recall": ("Recall", "RecallEvent"),
 }
 

@@ -70,46 +70,33 @@ class ForesightConfig:
 
 @dataclass
 class RecallConfig:
-    """Going back when the world contradicts what was foreseen; acting only, not in the paper. See `recall.py`.
+    """Going back to another demonstrated way when contradicted; acting only, not in the paper. See `recall.py`.
+
+    Lengths and times beyond these are taken from the demonstrations.
 
     Args:
         enabled (`bool`, *optional*, defaults to `True`):
-            Whether acting goes back on surprise. If so, hidden states are explored then and only then; if not,
-            foresight explores at every step, as in the paper.
-        surprise_threshold (`float`, *optional*, defaults to `4.0`):
-            Normalised innovation of the joints from which to go back, if the arm does not move as foreseen. It is one
-            on average while all goes as foreseen.
-        num_samples (`int`, *optional*, defaults to `60`):
-            Imagined futures.
-        noise_range (`tuple[float, float]`, *optional*, defaults to `(1.0, 5.0)`):
-            Range of how far the first sensations that they imagine deviate from the expected ones, in predicted
-            standard deviations.
-        horizon (`int`, *optional*, defaults to `60`):
-            Imagined steps by whose end futures are compared.
-        commitment (`int`, *optional*, defaults to `24`):
-            Imagined steps that are carried out, at the arm's pace, before it listens to its senses again.
-        memory (`float`, *optional*, defaults to `200.0`):
-            Steps in which the memory of a failed try fades to 1/e; 0 forgets at once.
-        at_rest (`bool`, *optional*, defaults to `True`):
-            Whether it also goes back when the arm has come to rest where no demonstration began or ended. It never
-            does if a demonstration paused on its way for 20 steps.
+            Whether acting goes back when contradicted. If so, foresight chooses then and only then, between remembered
+            states; if not, it explores at every step, as in the paper.
+        horizon (`float`, *optional*, defaults to `2.0`):
+            Seconds that candidates imagine ahead.
+        stay (`float`, *optional*, defaults to `1.5`):
+            Times as long as any demonstration stayed at a place that contradict.
+        strange (`float`, *optional*, defaults to `3.0`):
+            Times the usual difference between the scenes of demonstrations that contradict.
+        patience (`float`, *optional*, defaults to `0.8`):
+            Seconds without progress after which a way that is carried out is blocked.
     """
 
     enabled: bool = True
-    surprise_threshold: float = 4.0
-    num_samples: int = 60
-    noise_range: tuple[float, float] = (1.0, 5.0)
-    horizon: int = 60
-    commitment: int = 24
-    memory: float = 200.0
-    at_rest: bool = True
+    horizon: float = 2.0
+    stay: float = 1.5
+    strange: float = 3.0
+    patience: float = 0.8
 
     def __post_init__(self) -> None:
-        check_range(self, "surprise_threshold", above=1)
-        check_range(self, "num_samples", "horizon", low=1)
-        check_pair(self, "noise_range")
-        check_range(self, "noise_range", "memory", low=0)
-        check_range(self, "commitment", low=0, high=self.horizon)
+        check_range(self, "horizon", "patience", above=0, unit="s")
+        check_range(self, "stay", "strange", above=1)
 
 
 @draccus.decode.register(RecallConfig)
@@ -242,7 +229,7 @@ augmentation (`AugmentationConfig`):
             Hidden size of `LSTM_image`.
         shared_hidden_dim (`int`, *optional*, defaults to `20`):
             Hidden size of `LSTM_shared`.
-        log_variance_range (`tuple[float, float]`, *optional*, defaults to `(-9.0, 3.0)`):
+        log_variance_range (`tuple[float, float]`, *optional*, defaults to `(-14.0, 3.0)`):
             Soft bounds of predicted log-variances, in scaled units (data within [-0.8, 0.8]).
         command_target (`str`, *optional*, defaults to `"action"`):
             What is commanded: the demonstrated `action`, learned by a head of its own, or the predicted `next_state`
@@ -271,7 +258,7 @@ augmentation (`AugmentationConfig`):
     joint_hidden_dim: int = 50
     image_hidden_dim: int = 50
     shared_hidden_dim: int = 20
-    log_variance_range: tuple[float, float] = (-9.0, 3.0)
+    log_variance_range: tuple[float, float] = (-14.0, 3.0)
     command_target: str = "action"
     kernel: str = "auto"
 

@@ -12,16 +12,19 @@ from torch import Generator, Tensor, nn
 from .augmentation import augment_images, drifting_noise, hold_end, stall_indices
 from .checkpoint import find_weights, read_weights
 from .configuration_ufrnn import UFRNNConfig
+from .demonstrations import Demonstrations
 from .episodes import Episode, EpisodeStore
 from .foresight import UFRNN, ForesightTrace, Memory
 from .networks import ImageEncoder, Prediction, RangeScaler, gaussian_nll
-from .recall import Recall, RestDetector
+from .recall import Recall
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T", bound="UFRNNPolicy")
 
 ENCODER_PREFIX = "image_encoder."
+MEMORY_PREFIX = "demonstrations."
+FPS = 10.0  # control steps a second, unless the data set or the checkpoint says otherwise
 
 
 class UFRNNPolicy(PreTrainedPolicy):
@@ -69,15 +72,15 @@ class UFRNNPolicy(PreTrainedPolicy):
         self.image_encoder = ImageEncoder(config.cameras, config.autoencoder)
         self.joint_scaler = RangeScaler(config.joint_dim)
         self.model = _make_model(config)
-        self.rest = RestDetector(config.joint_dim)
-        self.recall = Recall(self.model, config, self.rest) if config.recall.enabled else None
+        fps = FPS if dataset_meta is None else dataset_meta.fps
+        self.demonstrations = Demonstrations(config.joint_dim, config.image_dim, fps)
+        self.recall = Recall(self.model, config, self.demonstrations) if config.recall.enabled else None
         # Training noise is a function of this seed and the update, so that a resumed run goes on exactly as if whole.
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
         if dataset_stats is not None:
             self._fit_joint_scaler(dataset_stats)
         self.episodes: EpisodeStore | None = None
-        self._observed: set[int] = set()  # episodes that `rest` has learned from
         if dataset_meta is not None:
             self.episodes = EpisodeStore(dataset_meta, config.cameras, self.image_encoder)
             config.drop_n_last_frames = _frames_to_drop(self.episodes.lengths)
@@ -198,18 +201,13 @@ class UFRNNPolicy(PreTrainedPolicy):
             self.episodes.encode()
         indices = batch["episode_index"].flatten().tolist()
         episodes = [self.episodes[index] for index in indices]
-        if self.training:
-            for index, episode in zip(indices, episodes, strict=True):
-                self._observe_rest(index, episode)
         generator = torch.Generator(self.updates.device).manual_seed(int(self.noise_seed) + int(self.updates))
         if self.trains_autoencoder:
             return self._autoencoder_loss(episodes, generator)
+        if self.training:
+            for index, episode in zip(indices, episodes, strict=True):
+                self.demonstrations.remember(index, *self._scaled(episode))
         return self._recurrent_loss(episodes, generator)
-
-    def _observe_rest(self, index: int, episode: Episode) -> None:
-        if index not in self._observed:
-            self.rest.observe(self.joint_scaler.scale(episode.states.to(self.updates.device)))
-            self._observed.add(index)
 
     def update(self) -> None:
         """Counts an update; `lerobot-train` calls it after each optimiser step. Closes the autoencoder's phase."""
@@ -253,8 +251,8 @@ class UFRNNPolicy(PreTrainedPolicy):
         loss = nll[mask].mean()
         joint_dim = self.model.network.joint_dim
         if self.config.command_target == "action":
-            # A command is as uncertain as the joints that it leads to.
-            log_variance = prediction.log_variance[..., :joint_dim]
+            # A command is as uncertain as the joints that it leads to, which it must not make more or less certain.
+            log_variance = prediction.log_variance[..., :joint_dim].detach()
             loss = loss + gaussian_nll(commands, prediction.command, log_variance).sum(-1)[mask].mean()
         variance = self.model.modality_variance(prediction)[mask].detach()  # (M, 2)
         if self.training:
@@ -297,15 +295,19 @@ class UFRNNPolicy(PreTrainedPolicy):
 
         In training L counts the steps for which the last moment is held on.
         """
-        device = self.updates.device
-        states = self.joint_scaler.scale(episode.states.to(device))
-        actions = self.joint_scaler.scale(episode.actions.to(device))
-        sensed = torch.cat((states, self.image_encoder.scaler.scale(episode.features)), -1)
+        sensed, actions = self._scaled(episode)
         if self.training:
             sensed, actions = (
                 hold_end(values, self.config.augmentation.hold_end_steps) for values in (sensed, actions)
             )
         return sensed[:-1], sensed[1:], actions[:-1]
+
+    def _scaled(self, episode: Episode) -> tuple[Tensor, Tensor]:
+        """What was sensed (L, D) and commanded (L, D_j), scaled."""
+        device = self.updates.device
+        joints = self.joint_scaler.scale(episode.states.to(device))
+        features = self.image_encoder.scaler.scale(episode.features.to(device))
+        return torch.cat((joints, features), -1), self.joint_scaler.scale(episode.actions.to(device))
 
     def _fit_joint_scaler(self, stats: dict[str, dict[str, Tensor]]) -> None:
         """One range for measured and commanded joints: a command fed back must mean what a measurement means."""
@@ -326,7 +328,15 @@ class UFRNNPolicy(PreTrainedPolicy):
     @classmethod
     def _load_as_safetensor(cls: type[T], model: T, model_file: str, map_location: str, strict: bool) -> T:
         """Loads weights and refuses a broken or foreign file: random layers would look like a bad policy."""
-        model.load_state_dict(read_weights(model_file, expected=model.state_dict()))
+        expected = {key: value for key, value in model.state_dict().items() if not key.startswith(MEMORY_PREFIX)}
+        weights = read_weights(model_file, expected, of_any_size=MEMORY_PREFIX)
+        model.load_state_dict(weights, strict=False)  # `read_weights` has checked all but the memory
+        if model.recall is not None and not any(key.startswith(MEMORY_PREFIX) for key in weights):
+            logger.warning(
+                "'%s' holds no memory of demonstrations: the policy cannot go back and acts as SH-RNN. Train it "
+                "anew, or go on with its training for an epoch.",
+                model_file,
+            )
         return model
 
     def _load_autoencoder(self, path: str) -> None:

@@ -28,7 +28,7 @@ class Imagination(NamedTuple):
     ahead: int  # of how many steps later the first imagined prediction is
     futures: Prediction  # what each of N candidates imagined, (T, N, ...)
     chosen: int  # which was kept
-    refuted: np.ndarray | None = None  # likeness of each to failed tries, (N,); with recall
+    refuted: np.ndarray | None = None  # weight against each, (N,); with recall
 
 
 @dataclass
@@ -107,10 +107,12 @@ def _look_into(policy: UFRNNPolicy, step: int, history: TrialHistory) -> None:
     if (trace := policy.last_trace) is not None:
         futures = Prediction(*(values[:, :, 0] for values in trace.imagined))
         history.imaginations.append(Imagination(step, 2, futures, int(trace.chosen[0])))
-    elif policy.recall is not None and policy.recall.events[0] and policy.recall.events[0][-1].step == step:
-        event = policy.recall.events[0][-1]
+    elif policy.recall is not None and (events := policy.recall.events) and events[0] and events[0][-1].step == step:
+        event = events[0][-1]
         history.returns.append(step)
-        if policy.recall.exploration == "foresight" and event.futures is not None:
-            # A step later at the earliest the arm is back and the plan begins.
-            refuted = event.refuted.cpu().numpy()
-            history.imaginations.append(Imagination(step, 3, event.futures, event.chosen, refuted))
+        if policy.config.exploration == "foresight" and event.futures is not None:
+            # The arm needs about as long for going back as it took to get here.
+            ahead = 2 + event.moments_back * policy.demonstrations.stride
+            history.imaginations.append(
+                Imagination(step, ahead, event.futures, event.chosen, event.refuted.cpu().numpy())
+            )
