@@ -14,12 +14,13 @@ the network makes of it, and foresight stays the judge. At run time only:
    the fork, found without looking for forks. Forks in a row are searched depth first. If all ways are refuted, the way
    may have been barred for a while only, so that they count as open once more. If there never was another, go on.
 4. **Select** (Sec. III-C): candidates imagine T steps in closed loop. Of those refuted least, the one whose predicted
-   variance falls most is kept.
+   variance falls most is kept, or one that goes the same way and whose scene is nearest.
 5. **Retrace** the trail to there, pose by pose, not letting go of what is held.
 6. **Carry out** the kept demonstration at the arm's own pace. Behind the fork the network is in command again as long
    as it goes the same way. If the arm is blocked, that way is refuted, too, and it is known which one it was.
 """
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -282,7 +283,11 @@ class Recall:
         strange = looks > self.config.recall.strange * looks.min().clamp(min=self.moments.alike)
         # Weights are rounded: small ones are no reason to prefer a way.
         keys = list(zip(strange.tolist(), (4 * refuted).round().tolist(), unsure.tolist(), strict=True))
-        return min(range(len(keys)), key=keys.__getitem__), futures
+        best = min(range(len(keys)), key=keys.__getitem__)
+        # Of the demonstrations that go its way, the one whose scene is nearest: objects may have moved.
+        same = self.moments.same_way(int(candidates[best]), phases, math.inf)[candidates] > REFUTED
+        same &= torch.tensor([key[:2] == keys[best][:2] for key in keys], device=same.device)
+        return int(looks.masked_fill(~same, math.inf).argmin()), futures
 
     def _retrace(self, plan: _Plan, joints: Tensor) -> Tensor | None:
         """5. What to command on the way back; `None` if the arm is there, or gets no nearer."""
