@@ -8,7 +8,6 @@ ratios of the pairs of each round.
 """
 
 import gc
-import itertools
 import json
 import os
 import platform
@@ -73,6 +72,7 @@ PAPER = UFRNNConfig(
 BATCH_SIZE, LENGTH = 5, 149  # an episode of 150 frames has 149 next ones to predict
 FAST, REFERENCE, SCAN = "fast kernel", "readable code", "XLA scan"
 CYCLE = 100  # ticks of UF-RNN in a round
+START, STOP, STOP_TICK = 0.3, 0.5, 75  # joints between which the arm moves, and the tick at which it stops
 PACKAGES = ("torch", "numba", "jax", "diffusers", "lerobot", "mujoco", "numpy")  # whose versions matter
 
 
@@ -240,7 +240,7 @@ def of_update(seconds: float) -> pd.DataFrame:
 
 
 def make_ufrnn(kernel: str, recall: bool = False) -> UFRNNPolicy:
-    """UF-RNN with default settings and random weights; with recall so sure of itself that everything surprises it."""
+    """UF-RNN with default settings and random weights; with recall, it remembers demonstrations that part."""
     torch.manual_seed(0)
     bounds = {"min": -torch.ones(NUM_JOINTS), "max": torch.ones(NUM_JOINTS)}
     config = UFRNNConfig(kernel=kernel, recall=RecallConfig(enabled=recall), **FEATURES)
@@ -249,8 +249,21 @@ def make_ufrnn(kernel: str, recall: bool = False) -> UFRNNPolicy:
     scaler.fit(-torch.ones_like(scaler.low), torch.ones_like(scaler.high))
     policy.model.foresight.schedule.observe(torch.tensor([[0.5, 0.5], [1.5, 1.5]]))
     if recall:
-        policy.model.network.joint_head.bias.data[NUM_JOINTS : 2 * NUM_JOINTS] = -100.0
+        remember_three_ways(policy)
     return policy.eval()
+
+
+def remember_three_ways(policy: UFRNNPolicy, count: int = 15, length: int = 150) -> None:
+    """Gives a policy demonstrations that part three ways where `time_ticks` lets the arm stop."""
+    generator = torch.Generator().manual_seed(0)
+    fork = policy.joint_scaler.scale(torch.full((1, NUM_JOINTS), STOP))
+    start = policy.joint_scaler.scale(torch.full((1, NUM_JOINTS), START))
+    along = (torch.arange(length)[:, None] - STOP_TICK) / STOP_TICK
+    for index in range(count):
+        way = torch.where(along < 0, fork - start, torch.eye(NUM_JOINTS)[index % 3])
+        joints = fork + along * way + 0.002 * torch.randn(length, NUM_JOINTS, generator=generator)
+        features = 0.05 * torch.randn(length, policy.config.image_dim, generator=generator)
+        policy.demonstrations.remember(index, torch.cat((joints, features), dim=-1), joints.roll(-1, 0))
 
 
 def make_other(name: str) -> PreTrainedPolicy:
@@ -266,17 +279,21 @@ def time_ticks(policies: dict[str, PreTrainedPolicy], seconds: float, min_rounds
     """
     generator = torch.Generator().manual_seed(0)
     images = torch.rand(16, 1, 3, IMAGE_SIZE, IMAGE_SIZE, generator=generator)
-    # An arm that does not move, which surprises a policy with recall, before changing images.
-    observations = itertools.cycle([{OBS_STATE: torch.full((1, NUM_JOINTS), 0.5), CAMERA: image} for image in images])
+    # An arm that stops, which contradicts a policy with recall, before changing images.
+    joints = [START + (STOP - START) * min(tick / STOP_TICK, 1.0) for tick in range(CYCLE)]
+    observations = [
+        {OBS_STATE: torch.full((1, NUM_JOINTS), value), CAMERA: images[tick % len(images)]}
+        for tick, value in enumerate(joints)
+    ]
     ticks: dict[str, list[list[float]]] = {name: [] for name in policies}
 
     def run_round(name: str, policy: PreTrainedPolicy) -> None:
         for _ in range(2 * warm_up):  # the caches still hold the weights of another policy
-            policy.select_action(dict(next(observations)))
+            policy.select_action(dict(observations[0]))
         policy.reset()  # drops the chunk that this began
         ticks[name].append([])
-        for _ in range(getattr(policy.config, "n_action_steps", CYCLE)):
-            batch = dict(next(observations))
+        for tick in range(getattr(policy.config, "n_action_steps", CYCLE)):
+            batch = dict(observations[tick % CYCLE])
             start = time.perf_counter()
             policy.select_action(batch)
             ticks[name][-1].append(1e3 * (time.perf_counter() - start))

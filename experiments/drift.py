@@ -41,7 +41,7 @@ class DriftConfig:
 def imagined_drift(policy: UFRNNPolicy, demonstrations: Sequence[Episode], num_steps: int) -> list[Tensor]:
     """Mean distance of T imagined poses from the nearest demonstrated one, (L,) for the L steps of each demonstration.
 
-    The policy reads the demonstrations, exploring as when it acts, and imagines from each of their steps without noise.
+    The policy reads the demonstrations, exploring as in training, and imagines from each of their steps without noise.
     Units are those of the scaled joints, which were demonstrated between -0.8 and 0.8.
     """
     poses = [policy.joint_scaler.scale(episode.states.to(policy.updates.device)) for episode in demonstrations]

@@ -297,7 +297,7 @@ class Memory(NamedTuple):
 
 
 class UFRNN(nn.Module):
-    """SH-LSTM whose hidden state foresight refines at every step, in training and at run time.
+    """SH-LSTM whose hidden state foresight refines at every step: in training, and in acting without recall.
 
     Args:
         config (`UFRNNConfig`):

@@ -30,14 +30,16 @@ FPS = 10.0  # control steps a second, unless the data set or the checkpoint says
 class UFRNNPolicy(PreTrainedPolicy):
     """Uncertainty-driven Foresight RNN (UF-RNN), and its baselines SH-RNN+noise and SH-RNN.
 
-    **Acting.** `select_action` encodes the cameras, scales the measured joints, advances the hidden state by one step,
-    lets foresight refine it, goes back to a remembered one when surprised (`recall.py`), and returns absolute joint
-    targets. The hidden state lives from `reset` to `reset`; `memory`, `last_trace` (of foresight at every step, so
-    without recall) and `recall.events` show what happened.
+    **Acting.** `select_action` encodes the cameras, scales the measured joints, advances the hidden state by one step
+    and returns absolute joint targets. When contradicted, it goes back to a fork and carries out another demonstrated
+    way, chosen by foresight among remembered states (`recall.py`); without recall, foresight refines the state at every
+    step. The hidden state lives from `reset` to `reset`; `memory`, `last_trace` (of foresight at every step, so without
+    recall) and `recall.events` show what happened.
 
     **Training** with stock `lerobot-train` goes through two phases, counted in updates and saved with the checkpoint:
     first the autoencoder (`autoencoder.steps` updates on frames of the batch's episodes), then, with its features
-    computed once and kept, the recurrent network on whole episodes. An item of a batch only *names* an episode.
+    computed once and kept, the recurrent network on whole episodes, which are remembered for acting (`demonstrations`).
+    An item of a batch only *names* an episode.
 
     Args:
         config (`UFRNNConfig`):

@@ -60,8 +60,8 @@ def decisive(history: TrialHistory, joint_dim: int) -> Imagination:
     """
     if not history.imaginations:
         raise ValueError(
-            "Nothing was imagined in this trial: the policy has no foresight, or was never surprised. Take a trial in "
-            "which the first try is wrong: another --kind or --seed."
+            "Nothing was imagined in this trial: the policy has no foresight, or was never contradicted. Take a trial "
+            "in which the first try is wrong: another --kind or --seed."
         )
     if history.imaginations[0].refuted is not None:
         return history.imaginations[-1]

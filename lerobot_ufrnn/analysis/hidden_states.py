@@ -29,7 +29,7 @@ def read_demonstrations(policy: UFRNNPolicy, dataset_dir: Path) -> list[Episode]
 
 @torch.no_grad()
 def states_along(policy: UFRNNPolicy, demonstrations: list[Episode]) -> list[HiddenState]:
-    """Hidden states of the policy that reads demonstrations instead of acting (teacher forcing), exploring as it does.
+    """Hidden states of the policy that reads demonstrations (teacher forcing), exploring as in training.
 
     For each demonstration the state after each of its L steps, (L, hidden size) each.
     """

@@ -41,9 +41,9 @@ class TrialHistory:
     joints: list[np.ndarray] = field(default_factory=list)  # measured at each step, (D_j,)
     variances: list[np.ndarray] = field(default_factory=list)  # mean one of joints and features after each step, (2,)
     states: list[HiddenState] = field(default_factory=list)  # after each step, (1, hidden size) each
-    # With recall when surprised, with foresight alone at each step, otherwise never.
+    # With recall when contradicted, with foresight alone at each step, otherwise never.
     imaginations: list[Imagination] = field(default_factory=list)
-    returns: list[int] = field(default_factory=list)  # steps at which recall went back: surprised, or a try was blocked
+    returns: list[int] = field(default_factory=list)  # steps at which recall went back, for whatever reason
     attempts: list[Attempt] = field(default_factory=list)  # also while the door was held, in order
     held: list[int] = field(default_factory=list)  # steps at which somebody held the door
     success: bool = False  # whether the door was opened, which ends the trial

@@ -24,7 +24,7 @@ def captions(history: TrialHistory) -> list[str]:
         if step in tries:
             text = f"tries to {tries[step]}"
         if step in history.returns:
-            text = "surprised: goes back"
+            text = "contradicted: goes back"
         texts.append(text)
     return [*texts[:-1], "opened"] if history.success else texts
 
@@ -38,7 +38,7 @@ def annotate(history: TrialHistory) -> list[Image.Image]:
         picture = Image.new("RGB", (width, height + BAR_HEIGHT))
         picture.paste(Image.fromarray(frame))
         draw, upper, lower = ImageDraw.Draw(picture), height + BAR_HEIGHT // 4, height + 3 * BAR_HEIGHT // 4
-        draw.text((8, upper), caption, ALARM if "surprised" in caption else WHITE, font, anchor="lm")
+        draw.text((8, upper), caption, ALARM if "goes back" in caption else WHITE, font, anchor="lm")
         draw.text((width - 8, upper), f"{number / FRAMES_PER_SECOND:.1f} s", WHITE, font, anchor="rm")
         left = 8.0
         for way in [direction for step, direction in history.attempts if step < number]:

@@ -15,7 +15,7 @@ COMMANDS = {
     "record": "record demonstrations of the scripted expert into a LeRobotDataset",
     "results": "turn the trial log of lerobot-eval into a table per door",
     "foresight": "draw what foresight imagines where the policy has to choose",
-    "video": "film a door that is found out: a wrong try, a surprise, another try",
+    "video": "film a door that is found out: a wrong try, back to the fork, another try",
     "hidden": "draw hidden states along the demonstrations and in a trial, model by model",
     "lyapunov": "draw how chaotic the imagined futures are along the demonstrations",
     "report": "put the tables, pictures and videos of a folder into one page",

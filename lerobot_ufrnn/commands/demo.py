@@ -34,8 +34,8 @@ class DemoConfig:
     autoencoder_steps: int = 400
     """Updates of the autoencoder."""
     recurrent_steps: int = 1500
-    """Updates of the recurrent network after that; 3 updates are an epoch of 15 demonstrations. Below 1000 the policy
-    expects to be wrong too often to be surprised; `configs/ufrnn.yaml` takes 9000."""
+    """Updates of the recurrent network after that; 3 updates are an epoch of 15 demonstrations;
+    `configs/ufrnn.yaml` takes 9000."""
     batch_size: int = 5
     """Episodes per update."""
     trials_per_kind: int = 10
@@ -154,7 +154,7 @@ def draw(config: DemoConfig) -> None:
                 f"--output={config.output_dir / 'foresight.png'}",
                 f"--door_offset={config.door_offset}",
             )
-        except RuntimeError as error:  # a policy that is never surprised imagines nothing
+        except RuntimeError as error:  # a policy that is never contradicted imagines nothing
             print(f"No picture of foresight: {error}", file=sys.stderr)
     keep_success_videos(config)
     shutil.rmtree(config.output_dir / "checkpoint", ignore_errors=True)

@@ -19,7 +19,7 @@ PARTS = {
     ),
     "found_out.gif": (
         "A door that is found out",
-        "What was tried so far stands below the picture, and when the policy was surprised and went back.",
+        "What was tried so far stands below the picture, and when the policy was contradicted and went back.",
         "ufrnn video --policy_path=... --output={folder}/found_out.gif",
     ),
     "foresight.png": (

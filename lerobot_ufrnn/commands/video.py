@@ -12,7 +12,7 @@ from .policies import DoorTrialConfig, load_policy, run_door_trial
 
 @dataclass(kw_only=True)
 class VideoConfig(DoorTrialConfig):
-    """Films one trial: with `kind=any` the first with a wrong first try and a surprise that opens the door at last."""
+    """Films one trial: with `kind=any` the first with a wrong first try that goes back and opens the door at last."""
 
     policy_path: str
     """Checkpoint folder or Hub repository of a `ufrnn` policy."""
@@ -37,7 +37,7 @@ def run(config: VideoConfig) -> None:
             break
     else:
         raise ValueError(
-            "In no trial was the first try wrong, the policy surprised and the door opened at last: give another "
+            "In no trial was the first try wrong, the policy contradicted and the door opened at last: give another "
             "--seed, or a --kind to film whatever happens."
         )
     write_gif(annotate(history), config.output)
