@@ -69,6 +69,8 @@ class Demonstrations(nn.Module):
         """
         if self._moments is None or self._moments[0] is not network:
             self._moments = network, Moments.of(self, network)
+            if self._moments[1] is None:
+                logger.info("Of %d demonstrations no two part: there is nothing to choose between.", len(self.lengths))
         return self._moments[1]
 
     def _apply(self, *args: Any, **kwargs: Any) -> "Demonstrations":
@@ -168,7 +170,9 @@ class Moments:
             begin=end - counts + 1,
             end=end,
             arc=torch.cat([torch.cat((step.new_zeros(1), step.cumsum(0))) for step in steps]),
-            half_step=torch.cat([torch.cat((step, step[-1:])) / 2 for step in steps]),
+            half_step=torch.cat(
+                [torch.cat((step, step[-1:] if len(step) else step.new_zeros(1))) / 2 for step in steps]
+            ),
             dwell=torch.cat([_dwell(part[:, :dim], part[:, dim:], near, 3 * alike) for part in parts]),
             near=near,
             alike=alike,
@@ -176,7 +180,6 @@ class Moments:
             lead=max(float((torch.cat(commands) - all_joints).norm(dim=-1).median()), 1e-3),
         )
         if all(float(moments.same_way(row, moments.begin, math.inf).min()) > 0.5 for row in range(len(joints))):
-            logger.info("The %d demonstrations never part: there is nothing to choose between.", len(joints))
             return None
         return moments
 
