@@ -16,7 +16,6 @@ SPACING = 0.1  # seconds from one remembered moment to the next
 MOST_MOMENTS = 4000  # of all demonstrations together; later demonstrations are not remembered
 NEIGHBOURS = 3  # of that many demonstrations the farthest tells how far one usually passes another
 FARTHEST_NEAR = 0.05  # most that may be called near, as a fraction of the extent of all demonstrations
-SLACK = 4  # moments by which two demonstrations of one way may be ahead of each other
 
 
 class Demonstrations(nn.Module):
@@ -101,11 +100,13 @@ class Moments:
         begin (`Tensor`), end (`Tensor`): first and last moment of each demonstration, int64 (n,).
         arc (`Tensor`): length of the joints' path from the beginning, (M,).
         half_step (`Tensor`): half the distance to the next moment, (M,).
+        apart (`Tensor`): how far each moment is from the path of each demonstration, (M, n).
         dwell (`Tensor`): for how many seconds the demonstration stayed near each; infinite where it ended, (M,).
         near (`float`): distance of joints that is near: how far one demonstration usually passes another.
         alike (`float`): the same of features.
         pace (`float`): usual distance from moment to moment.
         lead (`float`): usual distance from joints to their command.
+        spacing (`float`): seconds from moment to moment.
     """
 
     joints: Tensor
@@ -117,11 +118,13 @@ class Moments:
     end: Tensor
     arc: Tensor
     half_step: Tensor
+    apart: Tensor
     dwell: Tensor
     near: float
     alike: float
     pace: float
     lead: float
+    spacing: float
 
     @classmethod
     @torch.no_grad()
@@ -131,6 +134,7 @@ class Moments:
         if len(lengths) < 2:
             return None
         stride, dim = demonstrations.stride, network.joint_dim
+        spacing = stride / float(demonstrations.fps)
         rows = [torch.arange(0, length, stride) for length in lengths]
         sensed = demonstrations.sensed.split(lengths)
         parts = [values[row.to(values.device)] for values, row in zip(sensed, rows, strict=True)]
@@ -155,6 +159,7 @@ class Moments:
             to_each.scatter_(1, owner[:, None], math.inf)
             return to_each.sort(dim=-1).values[:, neighbours - 1]
 
+        half_step = torch.cat([torch.cat((step, step[-1:] if len(step) else step.new_zeros(1))) / 2 for step in steps])
         extent = float((all_joints.amax(0) - all_joints.amin(0)).norm())
         near = max(pace, min(float(to_neighbour(gaps).quantile(0.75)), FARTHEST_NEAR * extent))
         differences = to_neighbour(looks.masked_fill(gaps >= near, math.inf))
@@ -170,14 +175,14 @@ class Moments:
             begin=end - counts + 1,
             end=end,
             arc=torch.cat([torch.cat((step.new_zeros(1), step.cumsum(0))) for step in steps]),
-            half_step=torch.cat(
-                [torch.cat((step, step[-1:] if len(step) else step.new_zeros(1))) / 2 for step in steps]
-            ),
-            dwell=torch.cat([_dwell(part[:, :dim], part[:, dim:], near, 3 * alike) for part in parts]),
+            half_step=half_step,
+            apart=_nearest_of_each((gaps - half_step).clamp(min=0), owner, len(joints)),
+            dwell=torch.cat([_dwell(part[:, :dim], part[:, dim:], near, 3 * alike) for part in parts]) * spacing,
             near=near,
             alike=alike,
             pace=pace,
             lead=max(float((torch.cat(commands) - all_joints).norm(dim=-1).median()), 1e-3),
+            spacing=spacing,
         )
         if all(float(moments.same_way(row, moments.begin, math.inf).min()) > 0.5 for row in range(len(joints))):
             return None
@@ -206,26 +211,46 @@ class Moments:
 
         It is 1 where neither strays from the other, and falls to 0 from about twice `near` on.
         """
-        begin, end = int(phases[which]), int(self.end[which]) + 1
-        own = slice(begin, min(end, begin + 2 + int((self.arc[begin:end] - self.arc[begin] < length).sum())))
-        earlier = torch.maximum(phases - SLACK, self.begin)
+        ahead = self.arc - self.arc[phases][self.owner]
         index = torch.arange(len(self.arc), device=self.arc.device)
-        from_it = self.gap(self.joints[own]).masked_fill(index < earlier[self.owner], math.inf)
-        to_it = self.gap(self.joints, slice(int(earlier[which]), end)).amin(-1)
-        counts = (index >= phases[self.owner]) & (self.arc - self.arc[phases][self.owner] <= length)
-        strays = -_nearest_of_each(-to_it.masked_fill(~counts, -math.inf), self.owner, self.size)
-        strays = torch.maximum(strays, self.nearest_of_each(from_it).amax(0))
+        counts = (index >= phases[self.owner]) & (ahead <= length)
+        theirs = self.apart[:, which].masked_fill(~counts, -math.inf)
+        strays = -_nearest_of_each(-theirs, self.owner, self.size)
+        own = counts & (self.owner == which)
+        strays = torch.maximum(strays, self.apart[own].amax(0))
         return torch.exp(-0.5 * (strays / (2 * self.near)) ** 4)
 
     def parting(self, which: int, phases: Tensor, others: list[int]) -> int:
         """The moment from which on one demonstration has parted from all these others, given their moments (n,)."""
         begin = int(phases[which])
-        own, last = self.joints[begin : int(self.end[which]) + 1], 0
-        for other in others:
-            gap = self.gap(own, slice(int(phases[other]), int(self.end[other]) + 1)).amin(-1)
-            away = (gap >= 2 * self.near).nonzero()
-            last = max(last, int(away[0])) if len(away) else last
-        return begin + last
+        away = self.apart[begin : int(self.end[which]) + 1, others] >= 2 * self.near
+        first = away.to(torch.uint8).argmax(0) * away.any(0)
+        return begin + int(first.max() if len(others) else 0)
+
+    @torch.no_grad()
+    def not_followed(self, network: SHLSTM, stride: int) -> list[int]:
+        """Demonstrations that a network leaves when it imagines them from where they have parted from all other ways.
+
+        `stride` is the number of control steps from one moment to the next.
+        """
+        left = []
+        for which in range(self.size):
+            begin, end = int(self.begin[which]), int(self.end[which]) + 1
+            other_ways = self.same_way(which, self.begin, math.inf) < 0.5
+            together = (self.apart[begin:end, other_ways] < 2 * self.near).any(-1).nonzero()
+            start = begin + (int(together[-1]) + 1 if len(together) else 0)
+            if start >= end - 1:
+                continue  # all ways end alike
+            sensed = torch.cat((self.joints[start], self.features[start]))[None]
+            state, path = network.step(sensed, self.before.at(slice(start, start + 1))), []
+            for _ in range((end - start) * stride):
+                expected = network.predict_mean(state)
+                path.append(expected[:, : self.joints.shape[-1]])
+                state = network.step(expected, state)
+            missed = (torch.cat(path) - self.joints[end - 1]).norm(dim=-1).min()
+            if missed > max(4 * self.near, 0.25 * float(self.arc[end - 1] - self.arc[start])):
+                left.append(which)
+        return left
 
 
 def _nearest_of_each(distances: Tensor, owner: Tensor, count: int) -> Tensor:
@@ -234,12 +259,12 @@ def _nearest_of_each(distances: Tensor, owner: Tensor, count: int) -> Tensor:
 
 
 def _dwell(joints: Tensor, features: Tensor, near: float, alike: float) -> Tensor:
-    """Seconds (L,) for which a demonstration stayed near each of its moments without a break; infinite at its end."""
+    """For how many moments (L,) a demonstration stayed near each without a break; infinite at its end."""
     stays = (torch.cdist(joints, joints) <= near) & (torch.cdist(features, features) <= alike)
     index = torch.arange(len(joints), device=joints.device)
     leaves = index.where(~stays & (index > index[:, None]), len(joints)).amin(-1)
     came = index.where(~stays & (index < index[:, None]), -1).amax(-1)
-    return torch.where(leaves == len(joints), math.inf, (leaves - came - 1) * SPACING)
+    return torch.where(leaves == len(joints), math.inf, leaves - came - 1)
 
 
 def _states_before(network: SHLSTM, sensed: tuple[Tensor, ...], rows: list[Tensor]) -> HiddenState:

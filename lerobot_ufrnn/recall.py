@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Generator, Tensor
 
-from .demonstrations import SPACING, Demonstrations, Moments
+from .demonstrations import Demonstrations, Moments
 from .foresight import UFRNN, ForesightTrace, Memory, uncertainty
 from .networks import HiddenState, Prediction
 from .trail import LONGEST_TRAIL, AlignedTrail, Trail
@@ -197,16 +197,15 @@ class Recall:
         """1. What contradicts, or nothing."""
         moments, last = self.moments, episode.trail.last
         here = last.gaps <= moments.near + last.gaps.min()
-        looks = (moments.features - self._features(last.sensed)).norm(dim=-1) / moments.alike
-        least = looks[here].min()
+        least = last.looks[here].min()
         episode.strangeness.append(float(least))
         usual = sorted(episode.strangeness)[len(episode.strangeness) // 4]
         episode.strange = episode.strange + 1 if float(least) > self.config.recall.strange * max(usual, 1.0) else 0
         if episode.step < episode.silent_until:
             return ""
-        if episode.strange * SPACING >= STRANGE_SECONDS:
+        if episode.strange * moments.spacing >= STRANGE_SECONDS:
             return "strange"
-        longest = float(moments.dwell[here & (looks <= self.config.recall.strange + least)].max())
+        longest = float(moments.dwell[here & (last.looks <= self.config.recall.strange + least)].max())
         return "stayed" if episode.stayed / self._fps > self.config.recall.stay * longest + GRACE else ""
 
     def _reconsider(self, episode: _Episode, reason: str, tried: int | None = None) -> None:
@@ -325,7 +324,7 @@ class Recall:
             self._reconsider(episode, "blocked" if entered else "never entered", plan.which)
             back = None if episode.plan is None else self._retrace(episode.plan, joints)
             return None, command if back is None else back
-        wanted = moments.commands[min(plan.at + min(round(waited / SPACING), LONGEST_LEAD), last)] + plan.offset
+        wanted = moments.commands[min(plan.at + min(round(waited / moments.spacing), LONGEST_LEAD), last)] + plan.offset
         asked, own = moments.pull(joints, wanted), moments.pull(joints, command)
         agrees = float(asked @ own) > SAME_DIRECTION * float(asked.norm() * own.norm())
         plan.agreed = plan.agreed + 1 if agrees and plan.at > plan.parted else 0

@@ -21,6 +21,7 @@ class _Step:
     sensed: Tensor  # (D,)
     command: Tensor  # what was commanded then, (D_j,)
     gaps: Tensor  # distance of the joints from each remembered moment, (M,)
+    looks: Tensor  # difference of the features in units of `alike`, (M,)
     costs: Tensor  # of the best alignment up to here that ends at each remembered moment, (M,)
 
 
@@ -53,9 +54,9 @@ class Trail:
         moments = self.moments
         dim = moments.joints.shape[-1]
         gaps = moments.gap(sensed[None, :dim])[0]
-        looks = (moments.features - sensed[dim:]).norm(dim=-1)
+        looks = (moments.features - sensed[dim:]).norm(dim=-1) / moments.alike
         costs = (gaps / moments.near).square().clamp(max=100)
-        costs += 0.1 * (looks / moments.alike).square().clamp(max=20)
+        costs += 0.1 * looks.square().clamp(max=20)
         index = torch.arange(len(gaps), device=gaps.device) - moments.begin[moments.owner]
         if self._steps:
             so_far = best = self._steps[-1].costs
@@ -65,7 +66,7 @@ class Trail:
             costs = costs + best
         else:
             costs = costs + 0.2 * index
-        self._steps.append(_Step(sensed, command, gaps, costs - costs.min()))
+        self._steps.append(_Step(sensed, command, gaps, looks, costs - costs.min()))
         if len(self._steps) > LONGEST_TRAIL:
             del self._steps[0]
             if self.taken is not None:
@@ -78,8 +79,9 @@ class Trail:
 
     def aligned(self) -> "AlignedTrail":
         """The whole trail as tensors."""
-        fields = (torch.stack([getattr(step, name) for step in self._steps]) for name in _Step.__annotations__)
-        return AlignedTrail(self.moments, self.taken, *fields)
+        fields = ("sensed", "command", "gaps", "costs")
+        stacked = (torch.stack([getattr(step, name) for step in self._steps]) for name in fields)
+        return AlignedTrail(self.moments, self.taken, *stacked)
 
 
 @dataclass(frozen=True)
@@ -123,22 +125,26 @@ class AlignedTrail:
         return self.away[at] <= self.moments.near + self.away[at].min()
 
     @cached_property
-    def _likelihood(self) -> Tensor:
-        """Log-likelihood of each moment's joints and command beside those remembered, (T, M)."""
+    def _evidence(self) -> Tensor:
+        """How well each demonstration, from each of its moments on, explains the trail from each of its on, (T, M).
+
+        It is the sum of log-likelihoods of joints and commands beside those that are remembered.
+        """
         moments = self.moments
         pulls = torch.cdist(moments.pull(self.joints, self.commands), moments.pull(moments.joints, moments.commands))
-        return -0.5 * ((self.gaps / moments.near).square() + (2 * pulls / moments.lead).square())
+        likelihood = -0.5 * ((self.gaps / moments.near).square() + (2 * pulls / moments.lead).square())
+        for begin, end in zip(moments.begin.tolist(), moments.end.tolist(), strict=True):
+            of_it = likelihood[:, begin : end + 1]
+            of_it.copy_(of_it.flip(1).cummax(1).values.flip(1))
+        return likelihood.clamp(min=LEAST_LIKELY).flip(0).cumsum(0).flip(0)
 
     def followed(self, at: int) -> Tensor:
         """Probability (n,) that a demonstration was followed since a moment of the trail, of those that pass it."""
         near = self.near(at)
-        evidence = self._likelihood.new_full((self.moments.size,), -math.inf)
-        for which in near.nonzero()[:, 0].tolist():
-            moments = slice(int(self.phases[at, which]), int(self.moments.end[which]) + 1)
-            evidence[which] = INDEPENDENT * self._likelihood[at:, moments].amax(-1).clamp(min=LEAST_LIKELY).sum()
-        if self.taken is not None and self.taken[1] <= at and near[self.taken[0]]:
+        evidence = INDEPENDENT * self._evidence[at, self.phases[at]]
+        if self.taken is not None and self.taken[1] <= at:
             evidence[self.taken[0]] += TAKEN
-        return torch.softmax(evidence, 0)
+        return torch.softmax(evidence.masked_fill(~near, -math.inf), 0)
 
     def same_way(self, at: int, demonstrations: list[int]) -> Tensor:
         """How much each demonstration goes the way of these since a moment of the trail, (n, demonstrations)."""

@@ -10,7 +10,7 @@ from small import batch_of, small_config, train
 from small_network import FEATURES, JOINTS, is_close, network_config, small_model
 
 from lerobot_ufrnn import demonstrations
-from lerobot_ufrnn.demonstrations import SLACK, Demonstrations, Moments
+from lerobot_ufrnn.demonstrations import Demonstrations, Moments
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
 from lerobot_ufrnn.networks import SHLSTM
 
@@ -264,7 +264,7 @@ def test_a_demonstration_that_ends_early_goes_the_way_only_so_far():
 
 
 def test_a_phase_difference_within_one_way_is_no_difference():
-    early, late = line((0, 0), (3, 0)), np.concatenate((np.zeros((SLACK - 1, 2)), line((0, 0), (3, 0))))
+    early, late = line((0, 0), (3, 0)), np.concatenate((np.zeros((3, 2)), line((0, 0), (3, 0))))
     moments = moments_of(early, late, line((0, 0), (0, 3)))
     assert moments.same_way(0, moments.begin + 2, math.inf)[:2].tolist() == pytest.approx([1, 1])
 

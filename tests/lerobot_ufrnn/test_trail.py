@@ -20,6 +20,12 @@ def moments_of(*paths, scenes=None, commands=None) -> Moments:
     if commands is None:
         commands = [path[[min(step + 2, len(path) - 1) for step in range(len(path))]] for path in joints]
     total = int(lengths.sum())
+    half_steps = [torch.cat((step, step[-1:])) / 2 for step in steps]
+    everywhere = torch.cat(joints)
+    apart = [
+        (torch.cdist(everywhere, path) - half).clamp(min=0).amin(1)
+        for path, half in zip(joints, half_steps, strict=True)
+    ]
     return Moments(
         joints=torch.cat(joints),
         features=torch.zeros(total, 1) if scenes is None else torch.as_tensor(np.concatenate(scenes)).float(),
@@ -29,12 +35,14 @@ def moments_of(*paths, scenes=None, commands=None) -> Moments:
         begin=lengths.cumsum(0) - lengths,
         end=lengths.cumsum(0) - 1,
         arc=torch.cat([torch.cat((torch.zeros(1), step.cumsum(0))) for step in steps]),
-        half_step=torch.cat([torch.cat((step, step[-1:])) / 2 for step in steps]),
+        half_step=torch.cat(half_steps),
+        apart=torch.stack(apart, dim=1),
         dwell=torch.zeros(total),
         near=NEAR,
         alike=ALIKE,
         pace=0.1,
         lead=LEAD,
+        spacing=0.1,
     )
 
 
