@@ -44,6 +44,7 @@ class Demonstrations(nn.Module):
         self.register_buffer("indices", torch.zeros(0, dtype=torch.int64))
         self.register_buffer("fps", torch.tensor(float(fps)))
         self._moments: tuple[SHLSTM, Moments | None] | None = None
+        self._is_full = False
 
     @property
     def stride(self) -> int:
@@ -53,7 +54,12 @@ class Demonstrations(nn.Module):
     @torch.no_grad()
     def remember(self, index: int, sensed: Tensor, commands: Tensor) -> None:
         """Adds a demonstration, scaled: sensations (L, D) and commands (L, D_j). One too many is left out."""
-        if index in self.indices or len(self.sensed) + len(sensed) > MOST_MOMENTS * self.stride:
+        if index in self.indices:
+            return
+        if len(self.sensed) + len(sensed) > MOST_MOMENTS * self.stride:
+            if not self._is_full:
+                logger.info("The memory is full with %d demonstrations; more are not remembered.", len(self.lengths))
+            self._is_full = True
             return
         self.sensed = torch.cat((self.sensed, sensed))
         self.commands = torch.cat((self.commands, commands))
@@ -107,6 +113,7 @@ class Moments:
         pace (`float`): usual distance from moment to moment.
         lead (`float`): usual distance from joints to their command.
         spacing (`float`): seconds from moment to moment.
+        stride (`int`): control steps from moment to moment.
     """
 
     joints: Tensor
@@ -125,6 +132,7 @@ class Moments:
     pace: float
     lead: float
     spacing: float
+    stride: int
 
     @classmethod
     @torch.no_grad()
@@ -183,6 +191,7 @@ class Moments:
             pace=pace,
             lead=max(float((torch.cat(commands) - all_joints).norm(dim=-1).median()), 1e-3),
             spacing=spacing,
+            stride=stride,
         )
         if all(float(moments.same_way(row, moments.begin, math.inf).min()) > 0.5 for row in range(len(joints))):
             return None
@@ -228,11 +237,8 @@ class Moments:
         return begin + int(first.max() if len(others) else 0)
 
     @torch.no_grad()
-    def not_followed(self, network: SHLSTM, stride: int) -> list[int]:
-        """Demonstrations that a network leaves when it imagines them from where they have parted from all other ways.
-
-        `stride` is the number of control steps from one moment to the next.
-        """
+    def not_followed(self, network: SHLSTM) -> list[int]:
+        """Demonstrations that a network leaves when it imagines them from where they part from all other ways."""
         left = []
         for which in range(self.size):
             begin, end = int(self.begin[which]), int(self.end[which]) + 1
@@ -243,7 +249,7 @@ class Moments:
                 continue  # all ways end alike
             sensed = torch.cat((self.joints[start], self.features[start]))[None]
             state, path = network.step(sensed, self.before.at(slice(start, start + 1))), []
-            for _ in range((end - start) * stride):
+            for _ in range((end - start) * self.stride):
                 expected = network.predict_mean(state)
                 path.append(expected[:, : self.joints.shape[-1]])
                 state = network.step(expected, state)

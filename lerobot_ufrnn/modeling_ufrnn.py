@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -12,7 +13,7 @@ from torch import Generator, Tensor, nn
 from .augmentation import augment_images, drifting_noise, hold_end, stall_indices
 from .checkpoint import find_weights, read_weights
 from .configuration_ufrnn import UFRNNConfig
-from .demonstrations import Demonstrations
+from .demonstrations import Demonstrations, Moments
 from .episodes import Episode, EpisodeStore
 from .foresight import UFRNN, ForesightTrace, Memory
 from .networks import ImageEncoder, Prediction, RangeScaler, gaussian_nll
@@ -96,6 +97,8 @@ class UFRNNPolicy(PreTrainedPolicy):
         self.last_trace: ForesightTrace | None = None
         if self.recall is not None:
             self.recall.reset()
+            if not self.training:
+                self.demonstrations.moments(self.model.network)  # now, not in the first step of the episode
         self._thread = threading.get_ident()
 
     @torch.no_grad()
@@ -325,7 +328,15 @@ class UFRNNPolicy(PreTrainedPolicy):
         # A joint that hardly moves is not worth following to a fraction of a degree.
         self.joint_scaler.fit(low, high, relative_floor=0.25)
 
-    # ── Loading ───────────────────────────────────────────────────────
+    # ── Saving and loading ───────────────────────────────────────────────────────
+
+    def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
+        """Says in training which demonstrations the network has not learned to follow by itself."""
+        super()._save_pretrained(save_directory, *args, **kwargs)
+        moments = Moments.of(self.demonstrations, self.model.network) if self.training else None
+        if moments is not None:
+            left = self.demonstrations.indices[moments.not_followed(self.model.network)].tolist()
+            logger.info("Demonstrations that the network does not follow yet: %s of %d.", left or "none", moments.size)
 
     @classmethod
     def _load_as_safetensor(cls: type[T], model: T, model_file: str, map_location: str, strict: bool) -> T:

@@ -283,10 +283,11 @@ class Recall:
         # Weights are rounded: small ones are no reason to prefer a way.
         keys = list(zip(strange.tolist(), (4 * refuted).round().tolist(), unsure.tolist(), strict=True))
         best = min(range(len(keys)), key=keys.__getitem__)
-        # Of the demonstrations that go its way, the one whose scene is nearest: objects may have moved.
+        # Of the demonstrations that go its way, one whose scene is as near as any: objects may have moved.
         same = self.moments.same_way(int(candidates[best]), phases, math.inf)[candidates] > REFUTED
         same &= torch.tensor([key[:2] == keys[best][:2] for key in keys], device=same.device)
-        return int(looks.masked_fill(~same, math.inf).argmin()), futures
+        same &= looks <= looks[same].min() + 0.5 * self.moments.alike
+        return int(unsure.masked_fill(~same, math.inf).argmin()), futures
 
     def _retrace(self, plan: _Plan, joints: Tensor) -> Tensor | None:
         """5. What to command on the way back; `None` if the arm is there, or gets no nearer."""

@@ -43,6 +43,7 @@ def moments_of(*paths, scenes=None, commands=None) -> Moments:
         pace=0.1,
         lead=LEAD,
         spacing=0.1,
+        stride=1,
     )
 
 
