@@ -8,10 +8,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import jobs
+import networks
 import pytest
 import sweep
 import yaml
-from sweep import PROVENANCE_PATH, Network, SweepConfig, plan, read_model, record_missing
+from networks import PROVENANCE_PATH, Network
+from sweep import SweepConfig, plan, read_model, record
 from tables import RESULTS, read_table
 
 from env_door import provenance
@@ -89,7 +91,7 @@ def make_dataset(root: Path, episodes: int = 15) -> None:
 @pytest.fixture(autouse=True)
 def fake(monkeypatch) -> FakeCommands:
     commands = FakeCommands()
-    monkeypatch.setattr(sweep, "run_command", commands)
+    monkeypatch.setattr(networks, "run_command", commands)
     monkeypatch.setattr(jobs, "stopping", threading.Event())
     return commands
 
@@ -173,11 +175,11 @@ def test_a_killed_training_goes_on_from_its_last_whole_checkpoint(config, fake, 
 def test_a_killed_evaluation_is_repeated_from_scratch(config, fake, left):
     network = network_of(config)
     network.run()
-    network.trial_log(2).write_text(left)
+    network.trials[0].log.write_text(left)
     fake.commands.clear()
     assert network.run() == []
     assert fake.names == ["lerobot-eval"]
-    assert network.missing_trials(2) == set()
+    assert network.trials[0].missing == set()
 
 
 def test_an_evaluation_without_all_trials_has_failed_and_enters_no_table(config, fake, capsys):
@@ -231,7 +233,7 @@ def test_a_variant_tries_the_same_training_with_other_settings(config, fake, cap
 def test_a_checkpoint_that_was_not_kept_is_reported_with_those_that_were(config, capsys):
     network_of(replace(config, epochs=[])).run()
     assert len(network_of(replace(config, epochs=[1])).run()) == 1
-    assert "no checkpoint of epoch 1 (update 7); it has those of updates [8, 16]" in capsys.readouterr().out
+    assert "no checkpoint of update 7; it has those of updates [8, 16]" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -265,14 +267,14 @@ def test_missing_demonstrations_are_recorded_and_interrupted_ones_go_on(config, 
     )
     for resume in ("false", "true"):
         with pytest.raises(ValueError, match=r"There are 15 demonstrations in .*, not the 16 of --episodes_per_kind=8"):
-            record_missing(hinged)
+            record(hinged)
         assert fake.commands[-1][1].items() >= {"kinds": "[push,pull]", "num_steps": "100", "resume": resume}.items()
-    record_missing(replace(hinged, kinds=KINDS, episodes_per_kind=5))
+    record(replace(hinged, kinds=KINDS, episodes_per_kind=5))
     assert fake.commands[-1][1].items() >= {"episodes_per_kind": "5", "door_offset": "0.05", "matched": "false"}.items()
 
 
 def test_a_data_set_of_somebody_else_is_left_alone(config, fake):
-    record_missing(replace(config, episodes_per_kind=3))
+    record(replace(config, episodes_per_kind=3))
     assert fake.names == []
 
 
