@@ -19,7 +19,8 @@ from env_forks.tasks import EPISODE_STEPS, FPS, IMAGE_SIZE, TASKS
 def describe_way(env: gym.Env, info: dict[str, Any]) -> dict[str, Any]:
     """What a task and its last `info` tell of a trial; ways have the names of their suites."""
     suites = env.get_wrapper_attr("task").suites
-    return {"door_kind": suites[info["way"]], "attempts": tuple(suites[way] for way in info["attempts"])}
+    attempts = tuple(suites[way] for way in info["attempts"])
+    return {"door_kind": suites[info["way"]], "attempts": attempts, "path": tuple(env.get_wrapper_attr("path")[::2])}
 
 
 def make_task(*, trial_log: str | None, **env_kwargs: Any) -> gym.Env:

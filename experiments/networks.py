@@ -32,25 +32,14 @@ FREE_SETTINGS = ("save_freq", "log_freq", "output_dir", "job_name", "seed")  # m
 class Trials:
     """Trials of one checkpoint, and what becomes of them."""
 
-    name: str
+    name: str  # of their folder in that of the network
     step: int  # update whose checkpoint is tried
-    log: Path
-    environment: dict[str, Any]  # its flags: `{type: door}`
+    environment: dict[str, Any]  # its flags, such as `{type: door}`
     kinds: Sequence[str]  # all its suites
     count: int  # for each kind
     first_seed: int
     policy_flags: dict[str, Any]
-    keep: Callable[[list[Trial]], None]  # what to do with them
-
-    @property
-    def missing(self) -> set[tuple[str, int]]:
-        """Kinds and seeds of the trials that the log lacks: all if a kill left it in pieces."""
-        seeds = range(self.first_seed, self.first_seed + self.count)
-        try:
-            done = {(trial.door_kind, trial.seed) for trial in read_trials(self.log)}
-        except (FileNotFoundError, ValueError):
-            done = set()
-        return {(kind, seed) for kind in self.kinds for seed in seeds} - done
+    keep: Callable[[list[Trial]], None]
 
 
 @dataclass(frozen=True)
@@ -115,12 +104,25 @@ class Network:
         flags |= {"output_dir": folder, "save_freq": self.save_freq}
         run_command("lerobot-train", flags=flags, log=self.folder / "train.log", lock=lock)
 
+    def log_of(self, trials: Trials) -> Path:
+        """Log of some trials."""
+        return self.folder / trials.name / "trials.jsonl"
+
+    def missing(self, trials: Trials) -> set[tuple[str, int]]:
+        """Kinds and seeds of the trials that a log lacks: all if a kill left it in pieces."""
+        seeds = range(trials.first_seed, trials.first_seed + trials.count)
+        try:
+            done = {(trial.door_kind, trial.seed) for trial in read_trials(self.log_of(trials))}
+        except (FileNotFoundError, ValueError):
+            done = set()
+        return {(kind, seed) for kind in trials.kinds for seed in seeds} - done
+
     def evaluate(self, trials: Trials, lock: int) -> None:
         """Tries a checkpoint, unless all trials are there, and hands them on."""
-        folder = trials.log.parent
-        claim(folder.with_suffix(".json"), trials.policy_flags)
-        if trials.missing:
-            shutil.rmtree(folder, ignore_errors=True)
+        log = self.log_of(trials)
+        claim(log.parent.with_suffix(".json"), trials.policy_flags)
+        if self.missing(trials):
+            shutil.rmtree(log.parent, ignore_errors=True)
             if trials.step not in self.checkpoints:
                 raise FileNotFoundError(
                     f"{self.folder} has no checkpoint of update {trials.step}; it has those of updates "
@@ -129,18 +131,18 @@ class Network:
             flags = {
                 "policy.path": self.checkpoints[trials.step] / "pretrained_model",
                 **{f"env.{name}": value for name, value in trials.environment.items()},
-                "env.trial_log": trials.log,
+                "env.trial_log": log,
                 "eval.n_episodes": trials.count,
                 "eval.batch_size": min(EVALUATION_BATCH_SIZE, trials.count),
                 "eval.use_async_envs": "false",
-                "output_dir": folder,
+                "output_dir": log.parent,
                 "seed": trials.first_seed,
                 **{f"policy.{name}": json.dumps(value) for name, value in trials.policy_flags.items()},
             }
-            run_command("lerobot-eval", flags=flags, log=folder.with_suffix(".log"), lock=lock)
-            if missing := trials.missing:
-                raise RuntimeError(f"{trials.log} lacks {len(missing)} trials, such as {min(missing)}.")
-        trials.keep(first_of_each_kind(read_trials(trials.log), trials.count))
+            run_command("lerobot-eval", flags=flags, log=log.parent.with_suffix(".log"), lock=lock)
+            if missing := self.missing(trials):
+                raise RuntimeError(f"{log} lacks {len(missing)} trials, such as {min(missing)}.")
+        trials.keep(first_of_each_kind(read_trials(log), trials.count))
 
 
 def record_missing(root: Path, folder: Path, flags: dict[str, Any], wanted: int) -> None:

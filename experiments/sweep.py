@@ -124,27 +124,14 @@ def plan(config: SweepConfig, models: list[Model]) -> list[Network]:
 
 def make_network(config: SweepConfig, model: Model, seed: int, step_of: dict[int, int], save_freq: int) -> Network:
     """A network, to be tried at the updates that end some epochs."""
+    environment = {"type": "door", "task": ",".join(config.kinds)}
+    environment |= {name: getattr(config, name) for name in ("door_offset", "hold_seconds")}
+    shared = config.kinds, config.trials_per_kind, config.trial_seed, config.policy_flags
+    trials = []
+    for epoch, step in step_of.items():
+        keep = partial(add_counts, config, model.name, seed, epoch)
+        trials.append(Trials(f"{config.trials}/epoch{epoch:06d}", step, environment, *shared, keep))
     name, folder = f"{model.name}, seed {seed}", config.output_dir / model.name / f"seed{seed}"
-    environment = {
-        "type": "door",
-        "task": ",".join(config.kinds),
-        "door_offset": config.door_offset,
-        "hold_seconds": config.hold_seconds,
-    }
-    trials = [
-        Trials(
-            name=f"trials {config.trials} of epoch {epoch}",
-            step=step,
-            log=folder / config.trials / f"epoch{epoch:06d}" / "trials.jsonl",
-            environment=environment,
-            kinds=config.kinds,
-            count=config.trials_per_kind,
-            first_seed=config.trial_seed,
-            policy_flags=config.policy_flags,
-            keep=partial(add_counts, config, model.name, seed, epoch),
-        )
-        for epoch, step in step_of.items()
-    ]
     return Network(name, folder, model, seed, config.demonstrations, save_freq, trials)
 
 

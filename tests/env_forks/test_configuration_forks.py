@@ -1,5 +1,6 @@
 """What lerobot-eval and lerobot-train see."""
 
+import numpy as np
 import pytest
 import torch
 from draccus.utils import ParsingError
@@ -73,7 +74,10 @@ def test_rollout_of_lerobot_eval_sees_success_and_failure_and_logs_the_tries(tmp
     assert result["success"].any(dim=1).tolist() == [True, False]
     opened, failed = read_trials(log)
     assert (opened.seed, opened.attempts, opened.success) == (7, ("three_ways_1",), True)
-    assert failed == Trial(8, "three_ways_1", False, 150, ("three_ways_0", "three_ways_2"))
+    tried = ("three_ways_0", "three_ways_2")
+    assert failed == Trial(8, "three_ways_1", False, 150, tried, path=failed.path)
+    assert len(failed.path) == 76
+    assert np.linalg.norm(np.subtract(failed.path[-1], ends[2])) < np.linalg.norm(np.subtract(failed.path[0], ends[2]))
     assert (opened.first_try, failed.first_try_wrong) == (True, True)
     assert first_of_each_kind([failed, opened], 1) == [opened]
     assert preprocess_observation(env.reset(seed=[1, 2])[0])["observation.state"].shape == (2, 2)
