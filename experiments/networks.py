@@ -146,17 +146,23 @@ class Network:
 
 
 def record_missing(root: Path, folder: Path, flags: dict[str, Any], wanted: int) -> None:
-    """Records demonstrations in `root`, or the rest of them; the recorder refuses to mix them with others."""
+    """Records demonstrations in `root`, or the rest of them; neither we nor the recorder mix them with others."""
+    noted = folder / "record.json"
     with locked(folder / "record.lock") as lock:
         if root.exists() and not (root / PROVENANCE_PATH).exists():  # somebody's own
             return
-        flags = {**flags, "repo_id": REPO_ID, "root": root, "resume": str(root.exists()).lower()}
-        run_command("ufrnn", "record", flags=flags, log=folder / "record.log", lock=lock)
+        if noted.exists() and root.exists() and count_demonstrations(root)[0] == wanted:
+            claim(noted, flags)
+            return
+        noted.unlink(missing_ok=True)
+        all_flags = {**flags, "repo_id": REPO_ID, "root": root, "resume": str(root.exists()).lower()}
+        run_command("ufrnn", "record", flags=all_flags, log=folder / "record.log", lock=lock)
         if (episodes := count_demonstrations(root)[0]) != wanted:
             raise ValueError(
                 f"There are {episodes} demonstrations in {root}, not the {wanted} of --episodes_per_kind="
                 f"{flags['episodes_per_kind']}. Ask for as many, or give another --output_dir or --dataset_dir."
             )
+        claim(noted, flags)
 
 
 def count_demonstrations(root: Path) -> tuple[int, int]:

@@ -8,6 +8,7 @@ by `lerobot-eval`. Run it again to go on. The first network of each task comes b
 that is stopped early says something of every task. Jobs of a cluster may share all folders, as with sweep.py.
 """
 
+import contextlib
 import math
 import os
 from dataclasses import dataclass, field
@@ -21,12 +22,16 @@ import yaml
 from draccus.utils import ParsingError
 from epochs import MAX_CHECKPOINTS, Model, read_model
 from jobs import replace_text
-from networks import Network, Trials, add_to_table, count_demonstrations, record_missing, run_all
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from networks import Network, Trials, add_to_table, record_missing, run_all
 from script import run
 from tables import RESULTS, SAME, mean_text
 
 from env_door.checks import check_range
-from env_door.trials import Trial
+from env_door.trials import Trial, read_trials
+from env_forks.env import ForksEnv
 from env_forks.tasks import TASKS, Task
 from lerobot_ufrnn.analysis.results import markdown
 
@@ -46,7 +51,8 @@ NOTES = (
 
 @dataclass
 class SuiteConfig:
-    """Tries policies on all ambiguous tasks. The defaults take about HOURS hours on two cores."""
+    """Tries policies on all ambiguous tasks. On two cores the first network of every task takes about an hour, all
+    of the defaults 16: a network some seven minutes."""
 
     tasks: list[str] = field(default_factory=lambda: list(TASKS))  # names of tasks
     sets: list[int] = field(default_factory=lambda: [0, 1, 2])  # sets of demonstrations, each with seeds of its own
@@ -112,19 +118,12 @@ def make_network(config: SuiteConfig, name: str, number: int, model: Model, seed
             key = dict(zip(KEY, (name, number, seed, update, label), strict=True))
             kept = f"{config.trials_per_way}_trials{'_' * bool(variant)}{variant}/update{update:06d}"
             trials.append(Trials(kept, update, *shared, flags, partial(add_row, config.counts, key)))
-    prepare = partial(record, config, task, number, home)
-    folder, dataset = home / model.name / f"seed{seed}", home / "dataset"
+    folder, root = home / model.name / f"seed{seed}", home / "dataset"
+    recorded = {"env": "forks", "task": name, "episodes_per_kind": config.episodes_per_way}
+    recorded |= {"seed": number * SEEDS_OF_A_SET}
+    prepare = partial(record_missing, root, home, recorded, config.episodes_per_way * len(task.ways))
     label = f"{name}, set {number}, {model.name}, seed {seed}"
-    return Network(label, folder, model, seed, dataset, config.save_freq, trials, prepare)
-
-
-def record(config: SuiteConfig, task: Task, number: int, home: Path) -> None:
-    """Records a set of demonstrations, unless it is complete."""
-    root, wanted = home / "dataset", config.episodes_per_way * len(task.ways)
-    if root.exists() and count_demonstrations(root)[0] == wanted:
-        return
-    flags = {"env": "forks", "task": task.name, "episodes_per_kind": config.episodes_per_way}
-    record_missing(root, home, flags | {"seed": number * SEEDS_OF_A_SET}, wanted)
+    return Network(label, folder, model, seed, root, config.save_freq, trials, prepare)
 
 
 def add_row(counts: Path, key: dict[str, Any], trials: list[Trial]) -> None:
@@ -147,25 +146,24 @@ def needless_tries(task: Task, trial: Trial) -> int:
 
 def fewest_steps(task: Task) -> int:
     """Median over the ways of the steps of a search at a demonstrator's pace that tries no way needlessly."""
+
+    def length(points: np.ndarray) -> float:
+        return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
     nodes = np.array(task.tree.nodes)
-
-    def length(path: list[int]) -> float:
-        return float(np.linalg.norm(np.diff(nodes[path], axis=0), axis=1).sum())
-
-    paths = [task.path(way) for way in task.ways]
-    ends = [length(path) for path in paths]
-    last_legs = [length(path[-2:]) for path in paths]
-    # How far a try of a way goes; where only a lamp tells, to its end.
-    tries = [end - (0 if task.lamp else (1 - task.gate) * leg) for end, leg in zip(ends, last_legs, strict=True)]
-    steps, travelled, back = [], 0.0, 0.0  # `back` is how far the place of the last try is from the start
+    tips = nodes[list(task.tree.ends)] if task.lamp else task.gates(nodes)  # how far a try goes
+    steps, travelled, before, tried = [], 0.0, [0], nodes[:1]
     for way in task.ways:
-        previous = paths[way - 1] if way and not task.cue else [0]
-        shared = length([node for node, other in zip(paths[way], previous, strict=False) if node == other])
-        there = travelled + back - 2 * shared
-        barred = max(0, task.shut_steps - (there + tries[way]) / task.speed)
-        steps.append((there + ends[way] * (2 if task.back else 1)) / task.speed + barred)
+        path = task.path(way)
+        out = nodes[path]
+        fork = sum(node == other for node, other in zip(path, before, strict=False)) - 1
+        travelled += length(tried[fork:])
+        whole = travelled + length(out[fork:]) + (length(out) if task.back else 0)
+        behind = length(np.stack((tips[way], out[-1])))
+        steps.append(max(whole / task.speed, task.shut_steps + behind / task.speed))
         if not task.cue:
-            travelled, back = there + tries[way], tries[way]
+            before, tried = path, np.vstack((out[:-1], tips[way]))
+            travelled += length(tried[fork:])
     return round(float(np.median(steps)))
 
 
@@ -226,6 +224,60 @@ def bootstrap(rates: pd.Series) -> tuple[float, float] | None:
     return (low, high) if np.ptp(means) > SAME else None
 
 
+# ── The picture ───────────────────────────────────────────────────────
+
+
+def draw(table: pd.DataFrame, networks: list[Network], path: Path) -> None:
+    """A contact sheet: each task with the path of a trial that found out, and what was opened after most updates."""
+    last = table[table.updates == table.updates.max()]
+    names = [name for name in TASKS if name in set(last.task)]
+    columns = min(6, len(names))
+    rows = math.ceil(len(names) / columns)
+    figure = Figure(figsize=(2.1 * columns, 2.7 * rows), layout="constrained")
+    for number, name in enumerate(names, start=1):
+        panel = figure.add_subplot(rows, columns, number)
+        draw_trial(panel, TASKS[name], telling_trial(name, networks))
+        rates = (100 * last.opened / last.trials)[last.task == name].groupby(last.model).mean()
+        panel.set_title(name, fontsize=9, parse_math=False)
+        panel.set_xlabel("\n".join(f"{model}: {rate:.0f} %" for model, rate in rates.items()), fontsize=7)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
+
+
+def telling_trial(name: str, networks: list[Network]) -> Trial | None:
+    """Of the trials with the last checkpoints, unchanged, the quickest of those that opened and tried the most ways."""
+    trials = [
+        trial
+        for network in networks
+        for tried in network.trials
+        if tried.environment["task"] == name and tried.step == network.model.settings["steps"]
+        if not tried.policy_flags and not network.missing(tried)
+        for trial in read_trials(network.log_of(tried))
+    ]
+    return max(trials, key=lambda trial: (trial.success, len(set(trial.attempts)), -trial.steps), default=None)
+
+
+def draw_trial(panel: Axes, task: Task, trial: Trial | None) -> None:
+    """The task as it was when a trial began, the path from dark to bright, and the ways tried in their order."""
+    way, seed = (task.suites.index(trial.door_kind), trial.seed) if trial else (0, 0)
+    with contextlib.closing(ForksEnv(task.name, way, render_size=384)) as env:
+        env.reset(seed=seed)
+        panel.imshow(env.render(), extent=(0, 1, 0, 1))
+        ends = env.nodes[list(task.tree.ends)]
+    panel.set(xticks=[], yticks=[], xlim=(0, 1), ylim=(0, 1))
+    if trial is not None:
+        points = np.array(trial.path)
+        pieces = list(np.stack((points[:-1], points[1:]), 1))
+        panel.add_collection(LineCollection(pieces, array=np.arange(len(pieces)), cmap="plasma", linewidths=2))
+        for number, attempt in enumerate(dict.fromkeys(trial.attempts), start=1):
+            box = {"boxstyle": "circle", "color": "tab:green" if attempt == trial.door_kind else "tab:red"}
+            x, y = ends[task.suites.index(attempt)]
+            panel.text(x, y, str(number), color="w", ha="center", va="center", bbox=box)
+
+
+# ── The command ───────────────────────────────────────────────────────
+
+
 def main(config: SuiteConfig) -> None:
     """Does what is not done yet, then writes table and picture; a RuntimeError if something failed."""
     models = []
@@ -237,8 +289,6 @@ def main(config: SuiteConfig) -> None:
     networks = plan(config, models)
     failures = run_all(lambda: networks, config.workers)
     if config.counts.exists():
-        from suite_picture import draw
-
         table = read_counts(config.counts)
         replace_text(config.results / "table.md", describe(table))
         draw(table, networks, config.results / "picture.png")

@@ -308,4 +308,4 @@ def test_a_tiny_sweep_through_lerobots_own_commands_from_demonstrations_to_table
     assert (tmp_path / "table.csv").read_text() == table
     other = script(*flags, "--num_steps=150")
     assert other.returncode == 1
-    assert "was recorded with num_steps=100, now num_steps=150 is asked for" in other.stderr
+    assert "was made with other settings: num_steps was 100, now 150." in other.stderr
