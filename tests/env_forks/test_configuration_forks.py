@@ -33,6 +33,7 @@ def test_type_is_registered_with_its_features():
         ("task", "lamp,lamp", "got 'lamp,lamp'"),
         ("fps", 30, "at least 10 and at most 10 Hz, got 30"),
         ("episode_length", 0, "at least 1 step, got 0"),
+        ("render_size", 8, "at least 16 and at most 768 pixels, got 8"),
         ("max_parallel_tasks", 2, "must be 1, got 2"),
     ],
 )
