@@ -30,6 +30,7 @@ class Trial:
     door_offset: float = 0.0  # sideways shift in m
     held_at: int | None = None  # first control step, counted from 0, during which somebody held the door
     tried_while_held: tuple[str, ...] = ()  # directions other than its own tried meanwhile, in order
+    path: tuple[tuple[float, float], ...] = ()  # where the disc was at every second step, if there is one
 
     @property
     def first_try_wrong(self) -> bool:

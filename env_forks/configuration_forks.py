@@ -19,7 +19,8 @@ from env_forks.tasks import EPISODE_STEPS, FPS, IMAGE_SIZE, TASKS
 def describe_way(env: gym.Env, info: dict[str, Any]) -> dict[str, Any]:
     """What a task and its last `info` tell of a trial; ways have the names of their suites."""
     suites = env.get_wrapper_attr("task").suites
-    return {"door_kind": suites[info["way"]], "attempts": tuple(suites[way] for way in info["attempts"])}
+    attempts = tuple(suites[way] for way in info["attempts"])
+    return {"door_kind": suites[info["way"]], "attempts": attempts, "path": tuple(env.get_wrapper_attr("path")[::2])}
 
 
 def make_task(*, trial_log: str | None, **env_kwargs: Any) -> gym.Env:
@@ -39,6 +40,8 @@ class ForksEnvConfig(EnvConfig):
     """Control steps a second; the environment runs at no other rate."""
     episode_length: int = EPISODE_STEPS
     """Steps after which a trial is cut."""
+    render_size: int = 256
+    """Height and width of the pictures in videos, 16 to 768. Videos of 64 pixels make trials three times as fast."""
     trial_log: str | None = None
     """File that gets one JSON line for every finished trial."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -54,6 +57,7 @@ class ForksEnvConfig(EnvConfig):
             )
         check_range(self, "fps", low=FPS, high=FPS, unit="Hz")
         check_range(self, "episode_length", low=1, unit="step")
+        check_range(self, "render_size", low=16, high=768, unit="pixels")
         if self.max_parallel_tasks != 1:
             raise ParsingError(
                 f"--env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: a policy follows one trial at a "
@@ -73,7 +77,11 @@ class ForksEnvConfig(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Keywords of `gym.make`, but for task and way."""
-        return {"max_episode_steps": self.episode_length, "disable_env_checker": self.disable_env_checker}
+        return {
+            "max_episode_steps": self.episode_length,
+            "disable_env_checker": self.disable_env_checker,
+            "render_size": self.render_size,
+        }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """Make the vector environments, one suite for each way of each task: `three_ways_0` and so on."""

@@ -8,7 +8,6 @@ MAX_STEP = 0.03  # furthest movement in a control step
 MAX_PULL = 0.12  # a target is held within this distance of the disc
 FLEX = 0.15  # of a pull that is resisted, how much is measured as movement
 SUBSTEPS = 4
-END_RADIUS = 0.03  # within which the disc is at the end of a way
 GATE_REACH = 0.012  # how much further than it may leave the middle the disc is at a gate
 
 
@@ -32,7 +31,7 @@ class Corridors:
     @property
     def arrived(self) -> bool:
         """Whether the disc is at the end of the right way."""
-        return bool(np.linalg.norm(self._ends[self._way] - self.position) < END_RADIUS)
+        return bool(np.linalg.norm(self._ends[self._way] - self.position) < self.task.end_radius)
 
     def move(self, target: np.ndarray, may_open: bool) -> int | None:
         """Moves towards a target for one control step; returns the way whose gate or end is pressed on, if any."""
@@ -47,7 +46,7 @@ class Corridors:
         distances = np.linalg.norm(self.gates - self.position, axis=1)
         nearest = int(distances.argmin())
         at_gate = distances[nearest] < self.task.play + GATE_REACH
-        at_end = np.linalg.norm(self._ends[nearest] - self.position) < END_RADIUS
+        at_end = np.linalg.norm(self._ends[nearest] - self.position) < self.task.end_radius
         # Where gates stand at the fork, whoever is there is near to all of them: only a pull tells a try.
         pressed = self.task.gate > 0.2 or np.linalg.norm(pull) > 0.02
         return nearest if at_end or (at_gate and pressed) else None

@@ -115,6 +115,8 @@ class ForksEnv(gym.Env):
         self._large_picture: Picture | None = None
         self._shut_steps = 0 if demonstration else task.shut_steps
         self._steps = 0
+        self.path: list[tuple[float, float]] = []
+        self._note_position()
         self._attempts: list[int] = []
         self._arrived = self._failed = self._done = False
         self._seen: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=task.delay + 1)
@@ -127,6 +129,7 @@ class ForksEnv(gym.Env):
             raise ValueError(f"An action must hold two finite numbers, got {action!r}.")
         pressed = self.world.move(target, may_open=self._steps >= self._shut_steps)
         self._steps += 1
+        self._note_position()
         if pressed is not None and self._attempts[-1:] != [pressed]:
             self._attempts.append(pressed)
         self._failed |= self.task.cue and pressed not in (None, self.current_way)
@@ -141,6 +144,10 @@ class ForksEnv(gym.Env):
         if self._large_picture is None:
             self._large_picture = Picture(self.task, self.nodes, self.current_way, self.render_size)
         return self._draw(self._large_picture)
+
+    def _note_position(self) -> None:
+        x, y = self.world.position
+        self.path.append((round(float(x), 3), round(float(y), 3)))
 
     def _make_world(self) -> type:
         if not self.task.contact:

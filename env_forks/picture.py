@@ -44,15 +44,24 @@ class Picture:
         canvas = self._floor.copy()
         if self._headings is not None:
             for block, (x, y) in zip(gates, self._headings, strict=True):
-                turned = np.abs((self._points - block) @ np.array([[y, x], [-x, y]]))
-                self._paint(canvas, (HALF_BLOCK - turned).min(-1), GATE)
+                near = self._near(block, np.hypot(*HALF_BLOCK))
+                turned = np.abs((self._points[near] - block) @ np.array([[y, x], [-x, y]]))
+                self._paint(canvas[near], (HALF_BLOCK - turned).min(-1), GATE)
         if self._lamp:
             self._disc(canvas, self._sign, SIGN_RADIUS, LAMP_ON if lit else LAMP_OFF)
         self._disc(canvas, position, DISC_RADIUS, DISC)
         return canvas.astype(np.uint8)
 
     def _disc(self, canvas: np.ndarray, center: np.ndarray, radius: float, color: tuple[int, int, int]) -> None:
-        self._paint(canvas, radius - np.linalg.norm(self._points - center, axis=-1), color)
+        near = self._near(center, radius)
+        self._paint(canvas[near], radius - np.linalg.norm(self._points[near] - center, axis=-1), color)
+
+    def _near(self, center: np.ndarray, radius: float) -> tuple[slice, slice]:
+        """Rows and columns of all pixels within a radius: the others need not be painted."""
+        column, row = center[0] * self._size, (1 - center[1]) * self._size
+        reach = radius * self._size + 1
+        low, high = (np.clip(np.array([row, column]) + side, 0, self._size).astype(int) for side in (-reach, reach + 1))
+        return slice(low[0], high[0]), slice(low[1], high[1])
 
     def _paint(self, canvas: np.ndarray, depth: np.ndarray, color: tuple[int, int, int]) -> None:
         """Colours what lies `depth` > 0 inside of an outline, with a soft edge one pixel wide."""

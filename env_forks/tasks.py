@@ -70,6 +70,7 @@ class Task:
     cue: bool = False  # a colour tells the way, and a wrong try ends the trial
     lamp: bool = False  # no gate is shut; a lamp goes on at the end of the right way
     back: bool = False  # whether to go back to the start in the end
+    end_radius: float = 0.03  # within which the disc is at the end of a way
     shut_steps: int = 0  # for which the right gate stays shut, too
     noise: float = 0.0  # standard deviation on the measured position
     delay: int = 0  # steps by which observations are late
@@ -117,7 +118,9 @@ TASKS = {
         ),
         Task("gate_at_fork", "gates right behind the fork", gate=0.06),
         Task("slack", "wide corridors", play=0.06),
-        Task("out_and_back", "all ways end alike, at the start", back=True),
+        Task(
+            "out_and_back", "all ways end alike, at the start", back=True, end_radius=0.08
+        ),  # it may turn a little early
         Task("shown", "a colour tells the way: trying is wrong", cue=True),
         Task("no_fork", "a single way: going back is needless", fan(40)),
         Task("gives_way_later", "the right gate is shut for the first 12 s", shut_steps=120),

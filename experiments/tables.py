@@ -122,7 +122,7 @@ def summarize_networks(table: pd.DataFrame, by: Sequence[str] = ("model",)) -> p
     summary = groups[first].apply(lambda each: ", ".join(map(_number, each))).to_frame(f"{first}: each")
     for name in rates:
         summary[f"{name}: mean" if name == first else name] = groups[name].apply(
-            lambda each: _text(each.mean(), interval(each.dropna()))
+            lambda each: mean_text(each.mean(), interval(each.dropna()))
         )
     last = table[table.epoch == table.groupby("model").epoch.transform("max")]
     of_network = last.groupby([*by, "train_seed"]).trials.sum().groupby(list(by))
@@ -142,7 +142,7 @@ def differences(table: pd.DataFrame) -> pd.DataFrame:
     # From the last name back, which is `ufrnn` minus its baselines.
     for (model, rates), (other, of_other) in combinations(reversed(by_model.items()), 2):
         paired = model.split("+")[0] == other.split("+")[0]
-        cells = {name: _text(*difference(rates[name], of_other[name], paired), "+") for name in rates}
+        cells = {name: mean_text(*difference(rates[name], of_other[name], paired), "+") for name in rates}
         rows.append({"difference": f"{model} - {other}", **cells})
     return pd.DataFrame(rows)
 
@@ -157,7 +157,8 @@ def describe(table: pd.DataFrame) -> str:
     return "\n".join(f"{title}:\n\n{markdown(rows)}" for title, rows in sections.items() if not rows.empty)
 
 
-def _text(value: float, bounds: tuple[float, float] | None, sign: str = "") -> str:
+def mean_text(value: float, bounds: tuple[float, float] | None, sign: str = "") -> str:
+    """A mean with its interval, such as `83 [53, 100]`."""
     if math.isnan(value):  # a rate of nothing
         return "-"
     return _number(value, sign) + (f" [{', '.join(_number(bound, sign) for bound in bounds)}]" if bounds else "")

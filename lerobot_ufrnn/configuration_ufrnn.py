@@ -1,12 +1,8 @@
 """Configuration of the `ufrnn` policy. Where the paper leaves a choice open, each reading is a field."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
-import draccus
-from draccus.parsers.decoding import decode_dataclass
-from draccus.utils import DecodingError, ParsingError
+from draccus.utils import ParsingError
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
@@ -97,19 +93,6 @@ class RecallConfig:
     def __post_init__(self) -> None:
         check_range(self, "horizon", "patience", above=0, unit="s")
         check_range(self, "stay", "strange", above=1)
-
-
-@draccus.decode.register(RecallConfig)
-def _decode_recall(value: Any, path: Sequence[str] = ()) -> RecallConfig:
-    if not isinstance(value, dict):
-        raise DecodingError(
-            path,
-            f"`recall` is a group of fields, got {value!r}. This checkpoint or configuration file was written before "
-            "version 0.2, when all fields were flat: `recall: false` is `recall: {enabled: false}` now, "
-            "`autoencoder_steps` is `autoencoder: {steps: ...}`, and so on (CHANGELOG.md has the table). Weights of "
-            "such a checkpoint still fit: rewrite its config.json, or train anew.",
-        )
-    return decode_dataclass(RecallConfig, value, path)
 
 
 @dataclass

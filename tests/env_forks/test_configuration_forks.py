@@ -1,5 +1,6 @@
 """What lerobot-eval and lerobot-train see."""
 
+import numpy as np
 import pytest
 import torch
 from draccus.utils import ParsingError
@@ -32,6 +33,7 @@ def test_type_is_registered_with_its_features():
         ("task", "lamp,lamp", "got 'lamp,lamp'"),
         ("fps", 30, "at least 10 and at most 10 Hz, got 30"),
         ("episode_length", 0, "at least 1 step, got 0"),
+        ("render_size", 8, "at least 16 and at most 768 pixels, got 8"),
         ("max_parallel_tasks", 2, "must be 1, got 2"),
     ],
 )
@@ -73,7 +75,10 @@ def test_rollout_of_lerobot_eval_sees_success_and_failure_and_logs_the_tries(tmp
     assert result["success"].any(dim=1).tolist() == [True, False]
     opened, failed = read_trials(log)
     assert (opened.seed, opened.attempts, opened.success) == (7, ("three_ways_1",), True)
-    assert failed == Trial(8, "three_ways_1", False, 150, ("three_ways_0", "three_ways_2"))
+    tried = ("three_ways_0", "three_ways_2")
+    assert failed == Trial(8, "three_ways_1", False, 150, tried, path=failed.path)
+    assert len(failed.path) == 76
+    assert np.linalg.norm(np.subtract(failed.path[-1], ends[2])) < np.linalg.norm(np.subtract(failed.path[0], ends[2]))
     assert (opened.first_try, failed.first_try_wrong) == (True, True)
     assert first_of_each_kind([failed, opened], 1) == [opened]
     assert preprocess_observation(env.reset(seed=[1, 2])[0])["observation.state"].shape == (2, 2)

@@ -108,6 +108,16 @@ def test_the_lamp_goes_on_at_the_end_of_the_right_way_only():
     assert lamps == [[30, 30, 30], [250, 240, 60]]
 
 
+@pytest.mark.parametrize(("short_by", "success"), [(0.07, True), (0.1, False)])
+def test_out_and_back_may_turn_a_little_before_the_end(short_by, success):
+    env = ForksEnv("out_and_back")
+    env.reset(seed=0, options={"way": 1})
+    start, fork, end = env.nodes[env.task.path(1)]
+    turn = end + (fork - end) * short_by / np.linalg.norm(fork - end)
+    _, infos, terminated = play(env, 1, [fork] * 25 + [turn] * 25 + [fork] * 25 + [start] * 25)
+    assert infos[-1]["is_success"] == terminated == success
+
+
 def test_the_gate_that_gives_way_later_blocks_at_first():
     env = ForksEnv("gives_way_later")
     targets = plan(env, 1)

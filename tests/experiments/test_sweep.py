@@ -1,22 +1,19 @@
-import json
 import os
 import shutil
 import subprocess
 import sys
-import threading
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
-import jobs
 import pytest
 import sweep
 import yaml
-from sweep import PROVENANCE_PATH, Network, SweepConfig, plan, read_model, record_missing
+from networks import PROVENANCE_PATH, Network
+from sweep import SweepConfig, plan, read_model, record
 from tables import RESULTS, read_table
 
 from env_door import provenance
 from env_door.latch import KINDS
-from env_door.trials import Trial
 from lerobot_ufrnn.commands import parse_flags
 
 MODEL = """
@@ -27,79 +24,12 @@ save_freq: 8
 """
 
 
-class FakeCommands:
-    """Does in a blink what the commands would do, and notes them.
-
-    Commands that contain `fails` fail; training is killed while it writes the checkpoint of update `stop_at`.
-    """
-
-    def __init__(self):
-        self.commands: list[tuple[str, dict[str, str]]] = []
-        self.fails, self.stop_at, self.surplus = "", None, 1
-
-    @property
-    def names(self) -> list[str]:
-        return [name for name, _ in self.commands]
-
-    def __call__(self, name, *words, flags, log, lock):
-        flags = {flag: str(value) for flag, value in flags.items()}
-        self.commands.append((name, flags))
-        if self.fails and self.fails in " ".join(flags.values()):
-            raise RuntimeError(f"{name} ended with status 1")
-        {"ufrnn": self.record, "lerobot-train": self.train, "lerobot-eval": self.evaluate}[name](flags)
-
-    def record(self, flags):
-        make_dataset(Path(flags["root"]))
-        (Path(flags["root"]) / PROVENANCE_PATH).write_text("{}")
-
-    def train(self, flags):
-        checkpoints, start = Path(flags["output_dir"]) / "checkpoints", 0
-        if flags.get("resume") == "true":
-            start = int(Path(flags["config_path"]).parents[1].name)
-        else:
-            assert not checkpoints.parent.exists()
-            assert Path(flags["config_path"]).read_text() == MODEL
-        for step in range(start + 1, 17):
-            if step % int(flags["save_freq"]) == 0 or step == 16:
-                (checkpoints / f"{step:06d}" / "pretrained_model").mkdir(parents=True, exist_ok=True)
-                if step == self.stop_at:
-                    raise KeyboardInterrupt
-                (checkpoints / "last").unlink(missing_ok=True)
-                (checkpoints / "last").symlink_to(f"{step:06d}")
-
-    def evaluate(self, flags):
-        assert Path(flags["policy.path"]).is_dir()
-        log = Path(flags["env.trial_log"])
-        assert not log.exists()
-        log.parent.mkdir(parents=True)
-        first, held = int(flags["seed"]), float(flags["env.hold_seconds"]) > 0
-        trials = [
-            Trial(seed, kind, kind == "push", 100, ("push",), 1.0, 0.0, held_at=70 if kind == "push" and held else None)
-            for kind in flags["env.task"].split(",")
-            for seed in range(first, first + int(flags["eval.n_episodes"]) + self.surplus)
-        ]
-        log.write_text("".join(json.dumps(asdict(trial)) + "\n" for trial in trials))
-
-
-def make_dataset(root: Path, episodes: int = 15) -> None:
-    (root / "meta").mkdir(parents=True, exist_ok=True)
-    (root / "meta" / "info.json").write_text(json.dumps({"total_episodes": episodes, "total_frames": 150 * episodes}))
-
-
-@pytest.fixture(autouse=True)
-def fake(monkeypatch) -> FakeCommands:
-    commands = FakeCommands()
-    monkeypatch.setattr(sweep, "run_command", commands)
-    monkeypatch.setattr(jobs, "stopping", threading.Event())
-    return commands
-
-
 @pytest.fixture
-def config(tmp_path) -> SweepConfig:
+def config(tmp_path, fake) -> SweepConfig:
     """Two models, two seeds, two checkpoints, and somebody's demonstrations."""
     for name in ("one", "two"):
         (tmp_path / f"{name}.yaml").write_text(MODEL)
-    make_dataset(tmp_path / "out" / "dataset")
+    fake.make_dataset(tmp_path / "out" / "dataset")
     return SweepConfig(
         models=[tmp_path / "one.yaml", tmp_path / "two.yaml"],
         train_seeds=[0, 1],
@@ -173,11 +103,11 @@ def test_a_killed_training_goes_on_from_its_last_whole_checkpoint(config, fake, 
 def test_a_killed_evaluation_is_repeated_from_scratch(config, fake, left):
     network = network_of(config)
     network.run()
-    network.trial_log(2).write_text(left)
+    network.log_of(network.trials[0]).write_text(left)
     fake.commands.clear()
     assert network.run() == []
     assert fake.names == ["lerobot-eval"]
-    assert network.missing_trials(2) == set()
+    assert network.missing(network.trials[0]) == set()
 
 
 def test_an_evaluation_without_all_trials_has_failed_and_enters_no_table(config, fake, capsys):
@@ -231,7 +161,7 @@ def test_a_variant_tries_the_same_training_with_other_settings(config, fake, cap
 def test_a_checkpoint_that_was_not_kept_is_reported_with_those_that_were(config, capsys):
     network_of(replace(config, epochs=[])).run()
     assert len(network_of(replace(config, epochs=[1])).run()) == 1
-    assert "no checkpoint of epoch 1 (update 7); it has those of updates [8, 16]" in capsys.readouterr().out
+    assert "no checkpoint of update 7; it has those of updates [8, 16]" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -246,11 +176,11 @@ def test_a_checkpoint_that_was_not_kept_is_reported_with_those_that_were(config,
     ],
 )
 def test_a_network_of_another_model_or_other_demonstrations_is_not_taken_for_this(
-    config, capsys, model, episodes, change
+    config, fake, capsys, model, episodes, change
 ):
     network_of(config).run()
     config.models[0].write_text(model)
-    make_dataset(config.demonstrations, episodes)
+    fake.make_dataset(config.demonstrations, episodes)
     assert network_of(config).run() == ["one, seed 0: training"]
     assert f"other settings: {change}. Go back to them, give another --output_dir" in capsys.readouterr().out
 
@@ -265,14 +195,14 @@ def test_missing_demonstrations_are_recorded_and_interrupted_ones_go_on(config, 
     )
     for resume in ("false", "true"):
         with pytest.raises(ValueError, match=r"There are 15 demonstrations in .*, not the 16 of --episodes_per_kind=8"):
-            record_missing(hinged)
+            record(hinged)
         assert fake.commands[-1][1].items() >= {"kinds": "[push,pull]", "num_steps": "100", "resume": resume}.items()
-    record_missing(replace(hinged, kinds=KINDS, episodes_per_kind=5))
+    record(replace(hinged, kinds=KINDS, episodes_per_kind=5))
     assert fake.commands[-1][1].items() >= {"episodes_per_kind": "5", "door_offset": "0.05", "matched": "false"}.items()
 
 
 def test_a_data_set_of_somebody_else_is_left_alone(config, fake):
-    record_missing(replace(config, episodes_per_kind=3))
+    record(replace(config, episodes_per_kind=3))
     assert fake.names == []
 
 
@@ -378,4 +308,4 @@ def test_a_tiny_sweep_through_lerobots_own_commands_from_demonstrations_to_table
     assert (tmp_path / "table.csv").read_text() == table
     other = script(*flags, "--num_steps=150")
     assert other.returncode == 1
-    assert "was recorded with num_steps=100, now num_steps=150 is asked for" in other.stderr
+    assert "was made with other settings: num_steps was 100, now 150." in other.stderr

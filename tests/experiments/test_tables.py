@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 from curve import CurveConfig, draw
 from curve import main as curve
+from networks import add_to_table
 from scipy import stats
-from sweep import add_to_table
 from tables import (
     HELD_COUNTS,
     KEY,
@@ -46,8 +46,12 @@ def held(opened=(3, 8)) -> pd.DataFrame:
 
 def test_rows_are_merged_by_key_and_sorted(tmp_path):
     table = tmp_path / "results" / "table.csv"
-    add_to_table(table, pd.concat([results(opened=(5,), kinds=("pull",)), results("act", (5,), kinds=("pull",))]))
-    add_to_table(table, pd.concat([results(opened=(9,), kinds=("pull",)), results(opened=(5,), epochs=(20,))]))
+
+    def add(rows):
+        add_to_table(table, rows, KEY, lambda path: read_table(path, list(rows)[4:]))
+
+    add(pd.concat([results(opened=(5,), kinds=("pull",)), results("act", (5,), kinds=("pull",))]))
+    add(pd.concat([results(opened=(9,), kinds=("pull",)), results(opened=(5,), epochs=(20,))]))
     assert table.read_text().splitlines() == [
         HEADER,
         "act,0,100,pull,10,2,5,4,4",
@@ -57,7 +61,7 @@ def test_rows_are_merged_by_key_and_sorted(tmp_path):
     ]
     assert [path.name for path in table.parent.iterdir() if path.suffix != ".lock"] == ["table.csv"]
     with pytest.raises(ValueError, match=f"first line must be {HELD_HEADER}"):
-        add_to_table(table, held())
+        add(held())
 
 
 @pytest.mark.parametrize(

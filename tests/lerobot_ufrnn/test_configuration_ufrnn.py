@@ -114,13 +114,19 @@ def test_the_command_line_says_what_is_wrong():
         draccus.parse(EvalConfig, args=["--env.type=door", "--env.task=lift"])
 
 
-def test_configurations_of_before_the_groups_are_refused_with_what_to_write(tmp_path):
+def test_fields_in_groups_have_flags():
+    args = [*TRAIN, "--policy.recall.enabled=false", "--policy.autoencoder.steps=7"]
+    policy = draccus.parse(TrainPipelineConfig, args=args).policy
+    assert (policy.recall.enabled, policy.autoencoder.steps) == (False, 7)
+
+
+def test_configurations_of_before_the_groups_are_refused(tmp_path):
     UFRNNConfig(device="cpu")._save_pretrained(tmp_path)
     file = tmp_path / "config.json"
     old = json.loads(file.read_text())
     del old["recall"]
     file.write_text(json.dumps({**old, "recall": True, "recall_samples": 60}))
-    message = "`recall` is a group of fields, got .* `recall: {enabled: false}` now.* rewrite its config.json"
+    message = "`recall`: Failed when parsing .* of type .*RecallConfig"
     with pytest.raises(ParsingError, match=message):
         PreTrainedConfig.from_pretrained(tmp_path)
     with pytest.raises(ParsingError, match=message):
