@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 # 1. Contradicted?
 GRACE = 0.3  # seconds in addition
+NO_PROGRESS = 0.5  # seconds in addition for being no further along any demonstration, wherever the arm is
 STRANGE_SECONDS = 0.5  # for which the scene must look strange
 PAUSE = 1.0  # seconds for which nothing is asked again if there was no other way
 
@@ -51,6 +52,8 @@ RUN_UP = 1.0  # distance before the fork from which a way is entered, in units o
 LONGEST_LEAD = 4  # moments by which commands may be ahead of an arm that lags, so that they press on against a load
 SAME_DIRECTION = 0.8  # cosine from which network and demonstration command the same
 AGREED = 3  # steps for which they must, until the network is in command
+ON_WAY = 2.0  # distance from the demonstration up to which it may be, in units of `near`
+OFF_WAY = 4.0  # distance from which on the arm makes no progress
 FADING = 0.9  # of the offset between arm and demonstration, what is left after a moment
 
 
@@ -102,6 +105,8 @@ class _Episode:
     step: int = -1
     place: Tensor | None = None  # joints near which the arm has been for `stayed` steps
     stayed: int = 0
+    least_left: int = 1 << 30  # moments to the end of the demonstration that the trail was aligned best with, at least
+    no_progress: int = 0  # moments for which it has not become less
     strangeness: deque[float] = field(default_factory=lambda: deque(maxlen=LONGEST_TRAIL))
     strange: int = 0  # moments for which the scene has looked strange
     silent_until: int = 0
@@ -201,18 +206,26 @@ class Recall:
         episode.strangeness.append(float(least))
         usual = sorted(episode.strangeness)[len(episode.strangeness) // 4]
         episode.strange = episode.strange + 1 if float(least) > self.config.recall.strange * max(usual, 1.0) else 0
+        best = int(last.costs.argmin())
+        left = int(moments.end[moments.owner[best]]) - best
+        episode.no_progress = 0 if left < episode.least_left else episode.no_progress + 1
+        episode.least_left = min(left, episode.least_left)
         if episode.step < episode.silent_until:
             return ""
         if episode.strange * moments.spacing >= STRANGE_SECONDS:
             return "strange"
         longest = float(moments.dwell[here & (last.looks <= self.config.recall.strange + least)].max())
-        return "stayed" if episode.stayed / self._fps > self.config.recall.stay * longest + GRACE else ""
+        too_long = self.config.recall.stay * longest + GRACE
+        if episode.stayed / self._fps > too_long or episode.no_progress * moments.spacing > too_long + NO_PROGRESS:
+            return "stayed"
+        return ""
 
     def _reconsider(self, episode: _Episode, reason: str, tried: int | None = None) -> None:
         """2. to 4. Plans another way, if there is one. `tried` is the demonstration that was followed, where known."""
         trail = episode.trail.aligned()
         weight = NEVER_ENTERED if reason == "never entered" else 1.0
         episode.stayed, episode.strange, episode.plan = 0, 0, None
+        episode.no_progress, episode.least_left = 0, 1 << 30
         while True:
             ways_part = False
             for at in range(len(trail.sensed) - 1, -1, -max(1, len(trail.sensed) // 50)):
@@ -312,14 +325,14 @@ class Recall:
             plan.at = low + int((moments.joints[low : min(plan.at + 6, last) + 1] - joints).norm(dim=-1).argmin())
             plan.offset = joints - moments.joints[plan.at]
             plan.begun, plan.waited, episode.stayed = True, 0, 0
-        self._keep_up(plan, joints, last)
+        off_way = self._keep_up(plan, joints, last)
         if plan.at >= last:
             episode.plan = None
             return None, command
         waited = plan.waited / self._fps
         if waited > self.config.recall.patience:
-            off_way = float((moments.joints[begin : last + 1] - joints).norm(dim=-1).min())
-            entered = plan.at >= plan.parted or off_way < 0.5 * moments.near
+            beside = float((moments.joints[begin : last + 1] - joints).norm(dim=-1).min())
+            entered = plan.at >= plan.parted or beside < 0.5 * moments.near
             if not entered:
                 episode.failed_entries[plan.which] = episode.failed_entries.get(plan.which, 0) + 1
             self._reconsider(episode, "blocked" if entered else "never entered", plan.which)
@@ -328,6 +341,7 @@ class Recall:
         wanted = moments.commands[min(plan.at + min(round(waited / moments.spacing), LONGEST_LEAD), last)] + plan.offset
         asked, own = moments.pull(joints, wanted), moments.pull(joints, command)
         agrees = float(asked @ own) > SAME_DIRECTION * float(asked.norm() * own.norm())
+        agrees &= off_way <= ON_WAY * moments.near
         plan.agreed = plan.agreed + 1 if agrees and plan.at > plan.parted else 0
         if plan.agreed >= AGREED:
             return None, command
@@ -335,13 +349,18 @@ class Recall:
         state = self.model.network.step(sensed[None], moments.before.at(slice(plan.at, plan.at + 1)))
         return state, wanted
 
-    def _keep_up(self, plan: _Plan, joints: Tensor, last: int) -> None:
-        """Moves a plan on to where the arm is; an arm that lags is waited for."""
-        path = self.moments.joints[plan.at : min(plan.at + 4, last) + 1] + plan.offset
-        ahead = int((path - joints).norm(dim=-1).argmin())
+    def _keep_up(self, plan: _Plan, joints: Tensor, last: int) -> float:
+        """Moves a plan on to where the arm is, which is waited for; how far it is from its way."""
+        moments = self.moments
+        path = moments.joints[plan.at : min(plan.at + 4, last) + 1] + plan.offset
+        off_way, index = (path - joints).norm(dim=-1).min(0)
+        ahead = int(index)
         if ahead == 0 and plan.at < last and plan.waited >= self.demonstrations.stride - 1:
             # Where the demonstration stood still there is nothing to wait for.
-            ahead = int((path[1] - path[0]).norm() < 0.2 * self.moments.pace)
+            ahead = int((path[1] - path[0]).norm() < 0.2 * moments.pace)
+        if off_way > OFF_WAY * moments.near:
+            ahead = 0
         plan.waited = 0 if ahead else plan.waited + 1
         plan.at += ahead
         plan.offset = plan.offset * FADING**ahead
+        return float(off_way)
