@@ -193,7 +193,7 @@ class Moments:
             spacing=spacing,
             stride=stride,
         )
-        if all(float(moments.same_way(row, moments.begin, math.inf).min()) > 0.5 for row in range(len(joints))):
+        if all(moments.same_way(row, begin, math.inf).min() > 0.5 for row, begin in enumerate(moments.begin.tolist())):
             return None
         return moments
 
@@ -215,18 +215,13 @@ class Moments:
         """Distance of joints (K, D_j) from the path at these moments, (K, moments)."""
         return (torch.cdist(joints, self.joints[moments]) - self.half_step[moments]).clamp(min=0)
 
-    def same_way(self, which: int, phases: Tensor, length: float) -> Tensor:
-        """How much each demonstration goes the way of one, from these moments (n,) on, over a length of path, (n,).
+    def same_way(self, which: int, start: int, length: float) -> Tensor:
+        """How much each demonstration passes along a piece of one, (n,): from its moment `start` over a length of path.
 
-        It is 1 where neither strays from the other, and falls to 0 from about twice `near` on.
+        It is 1 where it does not stray from the piece, and falls to 0 from about twice `near` on.
         """
-        ahead = self.arc - self.arc[phases][self.owner]
-        index = torch.arange(len(self.arc), device=self.arc.device)
-        counts = (index >= phases[self.owner]) & (ahead <= length)
-        theirs = self.apart[:, which].masked_fill(~counts, -math.inf)
-        strays = -_nearest_of_each(-theirs, self.owner, self.size)
-        own = counts & (self.owner == which)
-        strays = torch.maximum(strays, self.apart[own].amax(0))
+        ahead = self.arc - self.arc[start]
+        strays = self.apart[(self.owner == which) & (ahead >= 0) & (ahead <= length)].amax(0)
         return torch.exp(-0.5 * (strays / (2 * self.near)) ** 4)
 
     def parting(self, which: int, phases: Tensor, others: list[int]) -> int:
@@ -242,7 +237,7 @@ class Moments:
         left = []
         for which in range(self.size):
             begin, end = int(self.begin[which]), int(self.end[which]) + 1
-            other_ways = self.same_way(which, self.begin, math.inf) < 0.5
+            other_ways = self.same_way(which, begin, math.inf) < 0.5
             together = (self.apart[begin:end, other_ways] < 2 * self.near).any(-1).nonzero()
             start = begin + (int(together[-1]) + 1 if len(together) else 0)
             if start >= end - 1:

@@ -44,6 +44,7 @@ PAUSE = 1.0  # seconds for which nothing is asked again if there was no other wa
 
 # 2. Which way was barred?
 LIKELY = 0.02  # probability from which a demonstration may have been followed
+BARRED = 5.0  # length of a way that is refuted with it, in units of `near`
 REFUTED = 0.5  # weight from which a way is refuted
 NEVER_ENTERED = 0.75  # weight against a way whose beginning could not be reached
 
@@ -220,8 +221,8 @@ class Recall:
             return "stayed"
         return ""
 
-    def _reconsider(self, episode: _Episode, reason: str, tried: int | None = None) -> None:
-        """2. to 4. Plans another way, if there is one. `tried` is the demonstration that was followed, where known."""
+    def _reconsider(self, episode: _Episode, reason: str, tried: tuple[int, int] | None = None) -> None:
+        """2. to 4. Plans another way, if there is one. `tried` is what was followed, where known, and its moment."""
         trail = episode.trail.aligned()
         weight = NEVER_ENTERED if reason == "never entered" else 1.0
         episode.stayed, episode.strange, episode.plan = 0, 0, None
@@ -243,7 +244,7 @@ class Recall:
                 return None
             episode.rounds += 1
 
-    def _refute(self, trail: AlignedTrail, at: int, tried: int | None) -> Tensor | None:
+    def _refute(self, trail: AlignedTrail, at: int, tried: tuple[int, int] | None) -> Tensor | None:
         """2. Weight against each demonstration (n,) if ways part at a moment of the trail; `None` if they do not."""
         near = trail.near(at)
         if near.sum() < 2:
@@ -251,12 +252,19 @@ class Recall:
         followed = trail.followed(at)
         if tried is not None:
             followed = torch.zeros_like(followed)
-            followed[tried] = 1.0
+            followed[tried[0]] = 1.0
         likely = (followed > LIKELY).nonzero()[:, 0].tolist()
-        same = trail.same_way(at, likely)
+        pieces = [self._barred(which, int(trail.phases[-1, which]) if tried is None else tried[1]) for which in likely]
+        same = torch.stack(pieces, dim=1)  # (n, likely)
         if tried is None and bool(same[near].min() > REFUTED):
             return None
         return same @ followed[likely]
+
+    def _barred(self, which: int, at: int) -> Tensor:
+        """How much each demonstration (n,) passes where one was barred at a moment of it, and goes on the same way."""
+        moments = self.moments
+        before = (moments.owner == which) & (moments.arc >= moments.arc[at] - moments.near)
+        return moments.same_way(which, int(before.nonzero()[0, 0]), BARRED * moments.near)
 
     def _take(self, episode: _Episode, reason: str, trail: AlignedTrail, at: int, candidates: Tensor) -> None:
         """3. and 4. Keeps one of the candidates (N,) that leave at a moment of the trail, and plans the way there."""
@@ -297,7 +305,7 @@ class Recall:
         keys = list(zip(strange.tolist(), (4 * refuted).round().tolist(), unsure.tolist(), strict=True))
         best = min(range(len(keys)), key=keys.__getitem__)
         # Of the demonstrations that go its way, one whose scene is as near as any: objects may have moved.
-        same = self.moments.same_way(int(candidates[best]), phases, math.inf)[candidates] > REFUTED
+        same = self.moments.same_way(int(candidates[best]), int(at[best]), math.inf)[candidates] > REFUTED
         same &= torch.tensor([key[:2] == keys[best][:2] for key in keys], device=same.device)
         same &= looks <= looks[same].min() + 0.5 * self.moments.alike
         return int(unsure.masked_fill(~same, math.inf).argmin()), futures
@@ -335,7 +343,7 @@ class Recall:
             entered = plan.at >= plan.parted or beside < 0.5 * moments.near
             if not entered:
                 episode.failed_entries[plan.which] = episode.failed_entries.get(plan.which, 0) + 1
-            self._reconsider(episode, "blocked" if entered else "never entered", plan.which)
+            self._reconsider(episode, "blocked" if entered else "never entered", (plan.which, plan.at))
             back = None if episode.plan is None else self._retrace(episode.plan, joints)
             return None, command if back is None else back
         wanted = moments.commands[min(plan.at + min(round(waited / moments.spacing), LONGEST_LEAD), last)] + plan.offset

@@ -13,7 +13,6 @@ LONGEST_TRAIL = 600  # moments that are remembered: a minute
 INDEPENDENT = 0.2  # of successive moments that many are evidence of their own
 LEAST_LIKELY = -10.0  # log-likelihood of a moment that a demonstration does not explain at all
 TAKEN = 2.0  # log-odds in favour of the demonstration that was taken over
-AHEAD = 4  # distance in units of `near` over which ways must be the same beyond what was gone
 
 
 @dataclass
@@ -145,11 +144,6 @@ class AlignedTrail:
         if self.taken is not None and self.taken[1] <= at:
             evidence[self.taken[0]] += TAKEN
         return torch.softmax(evidence.masked_fill(~near, -math.inf), 0)
-
-    def same_way(self, at: int, demonstrations: list[int]) -> Tensor:
-        """How much each demonstration goes the way of these since a moment of the trail, (n, demonstrations)."""
-        reach = float((self.joints[at:] - self.joints[at]).norm(dim=-1).max()) + AHEAD * self.moments.near
-        return torch.stack([self.moments.same_way(which, self.phases[at], reach) for which in demonstrations], dim=1)
 
     def entry(self, at: int, which: int, run_up: float) -> int:
         """Where on the trail to go back to for entering a demonstration near `at`.
