@@ -211,9 +211,9 @@ class Moments:
         earlier = torch.maximum(phases - SLACK, self.begin)
         index = torch.arange(len(self.arc), device=self.arc.device)
         from_it = self.gap(self.joints[own]).masked_fill(index < earlier[self.owner], math.inf)
-        to_it = self.gap(self.joints, slice(int(earlier[which]), end)).amin(-1)
-        counts = (index >= phases[self.owner]) & (self.arc - self.arc[phases][self.owner] <= length)
-        strays = -_nearest_of_each(-to_it.masked_fill(~counts, -math.inf), self.owner, self.size)
+        ahead = (index >= phases[self.owner]) & (self.arc - self.arc[phases][self.owner] <= length)
+        to_it = self.gap(self.joints[ahead], slice(int(earlier[which]), end)).amin(-1)
+        strays = to_it.new_zeros(self.size).scatter_reduce(0, self.owner[ahead], to_it, "amax")
         strays = torch.maximum(strays, self.nearest_of_each(from_it).amax(0))
         return torch.exp(-0.5 * (strays / (2 * self.near)) ** 4)
 

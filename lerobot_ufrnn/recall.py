@@ -214,14 +214,18 @@ class Recall:
         weight = NEVER_ENTERED if reason == "never entered" else 1.0
         episode.stayed, episode.strange, episode.plan = 0, 0, None
         while True:
-            ways_part = False
+            ways_part, passing = False, None
             for at in range(len(trail.sensed) - 1, -1, -max(1, len(trail.sensed) // 50)):
+                near = trail.near(at)
+                if passing is not None and torch.equal(near, passing):
+                    continue  # where the same demonstrations passed later, none left for good
+                passing = near
                 against = self._refute(trail, at, tried)
                 if against is None:
                     continue
                 ways_part = True
                 refuted = episode.refuted + weight * against
-                is_open = trail.near(at) & (refuted < episode.rounds + REFUTED)
+                is_open = near & (refuted < episode.rounds + REFUTED)
                 if is_open.any():
                     episode.refuted = refuted
                     return self._take(episode, reason, trail, at, is_open.nonzero()[:, 0])
@@ -235,9 +239,10 @@ class Recall:
         near = trail.near(at)
         if near.sum() < 2:
             return None
-        followed = trail.followed(at)
-        if tried is not None:
-            followed = torch.zeros_like(followed)
+        if tried is None:
+            followed = trail.followed(at)
+        else:
+            followed = torch.zeros_like(trail.away[at])
             followed[tried] = 1.0
         likely = (followed > LIKELY).nonzero()[:, 0].tolist()
         same = trail.same_way(at, likely)
