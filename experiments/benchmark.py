@@ -38,6 +38,7 @@ from torch import Tensor
 from env_door.checks import check_range
 from lerobot_ufrnn.analysis.results import markdown
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig, ForesightConfig, RecallConfig, UFRNNConfig
+from lerobot_ufrnn.demonstrations import MOST_MOMENTS, Demonstrations
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
@@ -73,6 +74,7 @@ PAPER = UFRNNConfig(
 BATCH_SIZE, LENGTH = 5, 149  # an episode of 150 frames has 149 next ones to predict
 FAST, REFERENCE, SCAN = "fast kernel", "readable code", "XLA scan"
 CYCLE = 100  # ticks of UF-RNN in a round
+HELD_AT = 0.1  # rad, where all joints are held
 PACKAGES = ("torch", "numba", "jax", "diffusers", "lerobot", "mujoco", "numpy")  # whose versions matter
 
 
@@ -240,7 +242,7 @@ def of_update(seconds: float) -> pd.DataFrame:
 
 
 def make_ufrnn(kernel: str, recall: bool = False) -> UFRNNPolicy:
-    """UF-RNN with default settings and random weights; with recall so sure of itself that everything surprises it."""
+    """UF-RNN with default settings and random weights; with recall its memory is full, and whatever it does fails."""
     torch.manual_seed(0)
     bounds = {"min": -torch.ones(NUM_JOINTS), "max": torch.ones(NUM_JOINTS)}
     config = UFRNNConfig(kernel=kernel, recall=RecallConfig(enabled=recall), **FEATURES)
@@ -249,8 +251,19 @@ def make_ufrnn(kernel: str, recall: bool = False) -> UFRNNPolicy:
     scaler.fit(-torch.ones_like(scaler.low), torch.ones_like(scaler.high))
     policy.model.foresight.schedule.observe(torch.tensor([[0.5, 0.5], [1.5, 1.5]]))
     if recall:
-        policy.model.network.joint_head.bias.data[NUM_JOINTS : 2 * NUM_JOINTS] = -100.0
+        start = policy.joint_scaler.scale(torch.full((NUM_JOINTS,), HELD_AT))
+        remember_ways(policy.demonstrations, start, config.image_dim)
     return policy.eval()
+
+
+def remember_ways(demonstrations: Demonstrations, start: Tensor, feature_dim: int) -> None:
+    """Fills a memory with 25 demonstrations of 160 moments, five of each of five ways that part at once."""
+    ways = torch.nn.functional.normalize(torch.randn(5, NUM_JOINTS), dim=-1)
+    step = torch.arange(MOST_MOMENTS // 25)[:, None] / 100
+    for index in range(25):
+        joints = start + step * ways[index // 5] + 1e-3 * torch.randn(NUM_JOINTS)
+        sensed = torch.cat((joints, 0.1 * torch.randn(len(step), feature_dim)), dim=-1)
+        demonstrations.remember(index, sensed, joints + ways[index // 5] / 50)
 
 
 def make_other(name: str) -> PreTrainedPolicy:
@@ -266,8 +279,9 @@ def time_ticks(policies: dict[str, PreTrainedPolicy], seconds: float, min_rounds
     """
     generator = torch.Generator().manual_seed(0)
     images = torch.rand(16, 1, 3, IMAGE_SIZE, IMAGE_SIZE, generator=generator)
-    # An arm that does not move, which surprises a policy with recall, before changing images.
-    observations = itertools.cycle([{OBS_STATE: torch.full((1, NUM_JOINTS), 0.5), CAMERA: image} for image in images])
+    # An arm that is held, which contradicts whatever a policy with recall remembers, before changing images.
+    state = torch.full((1, NUM_JOINTS), HELD_AT)
+    observations = itertools.cycle([{OBS_STATE: state, CAMERA: image} for image in images])
     ticks: dict[str, list[list[float]]] = {name: [] for name in policies}
 
     def run_round(name: str, policy: PreTrainedPolicy) -> None:
@@ -292,7 +306,7 @@ def of_acting(seconds: float) -> pd.DataFrame:
 
     ACT and Diffusion Policy compute a chunk of actions in one tick and only read it in the next ones: the worst tick is
     the longest of each chunk, for UF-RNN the longest of 100; amortised is the mean over it. With recall the worst tick
-    is one that goes back and imagines.
+    is one that goes back, with 4,000 remembered moments.
     """
     policies: dict[str, PreTrainedPolicy] = {"ACT": make_other("act")}
     policies["UF-RNN, foresight at each step, fast kernel"] = make_ufrnn("fast")
