@@ -37,6 +37,7 @@ from torch import Tensor
 from env_door.checks import check_range
 from lerobot_ufrnn.analysis.results import markdown
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig, ForesightConfig, RecallConfig, UFRNNConfig
+from lerobot_ufrnn.demonstrations import MOST_MOMENTS, Demonstrations
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
@@ -309,7 +310,7 @@ def of_acting(seconds: float) -> pd.DataFrame:
 
     ACT and Diffusion Policy compute a chunk of actions in one tick and only read it in the next ones: the worst tick is
     the longest of each chunk, for UF-RNN the longest of 100; amortised is the mean over it. With recall the worst tick
-    is one that goes back and imagines.
+    is one that goes back, with 4,000 remembered moments.
     """
     policies: dict[str, PreTrainedPolicy] = {"ACT": make_other("act")}
     policies["UF-RNN, foresight at each step, fast kernel"] = make_ufrnn("fast")

@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 
 SPACING = 0.1  # seconds from one remembered moment to the next
 MOST_MOMENTS = 4000  # of all demonstrations together; later demonstrations are not remembered
-NEIGHBOURS = 3  # of that many demonstrations the farthest tells how far one usually passes another
+NEIGHBOURS = 3  # of at most that many demonstrations the farthest tells how far one usually passes another
 FARTHEST_NEAR = 0.05  # most that may be called near, as a fraction of the extent of all demonstrations
 
 
@@ -159,13 +159,12 @@ class Moments:
         end = counts.cumsum(0) - 1
         all_joints, features = torch.cat(joints), torch.cat([part[:, dim:] for part in parts])
         gaps, looks = torch.cdist(all_joints, all_joints), torch.cdist(features, features)
-        neighbours = min(NEIGHBOURS, len(joints) - 1)
 
-        def to_neighbour(distances: Tensor) -> Tensor:
+        def to_neighbour(distances: Tensor, rank: int) -> Tensor:
             """Distance (M,) of each moment from the demonstration that passes it as so many-th nearest."""
             to_each = _nearest_of_each(distances, owner, len(joints))
             to_each.scatter_(1, owner[:, None], math.inf)
-            return to_each.sort(dim=-1).values[:, neighbours - 1]
+            return to_each.sort(dim=-1).values[:, rank - 1]
 
         half_step = torch.cat([torch.cat((step, step[-1:] if len(step) else step.new_zeros(1))) / 2 for step in steps])
         extent = float((all_joints.amax(0) - all_joints.amin(0)).norm())

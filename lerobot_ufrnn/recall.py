@@ -228,14 +228,18 @@ class Recall:
         episode.stayed, episode.strange, episode.plan = 0, 0, None
         episode.no_progress, episode.least_left = 0, 1 << 30
         while True:
-            ways_part = False
+            ways_part, passing = False, None
             for at in range(len(trail.sensed) - 1, -1, -max(1, len(trail.sensed) // 50)):
+                near = trail.near(at)
+                if passing is not None and torch.equal(near, passing):
+                    continue  # where the same demonstrations passed later, none left for good
+                passing = near
                 against = self._refute(trail, at, tried)
                 if against is None:
                     continue
                 ways_part = True
                 refuted = episode.refuted + weight * against
-                is_open = trail.near(at) & (refuted < episode.rounds + REFUTED)
+                is_open = near & (refuted < episode.rounds + REFUTED)
                 if is_open.any():
                     episode.refuted = refuted
                     return self._take(episode, reason, trail, at, is_open.nonzero()[:, 0])

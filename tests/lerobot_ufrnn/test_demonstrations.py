@@ -155,7 +155,9 @@ def test_near_is_how_far_demonstrations_pass_each_other_but_no_less_than_pace_an
     assert near(0.0) == pytest.approx(0.1)  # pace
     # To the third nearest: 3 for the outer ones, 2 for the inner ones; the third quartile is an outer one.
     assert near(0.05) == pytest.approx(0.15)
-    assert near(0.5) == pytest.approx(0.05 * math.hypot(12, 1.5))
+    # Where that is more than a twentieth of their extent, those farther off go another way: it is to the nearest.
+    assert near(0.5) == pytest.approx(0.5)
+    assert near(1.0) == pytest.approx(0.05 * math.hypot(12, 3))
 
 
 def test_alike_is_how_much_scenes_differ_from_one_demonstration_to_another_where_they_pass_each_other():

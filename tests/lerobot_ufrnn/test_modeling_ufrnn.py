@@ -6,10 +6,11 @@ import torch
 from lerobot.datasets import dataset_reader
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from oracle import Oracle
-from small import batch_of, make_dataset, observation, small_config, train
+from safetensors.torch import load_file, save_file
+from small import batch_of, make_dataset, observation, remember_ways, small_config, train
 
+from lerobot_ufrnn.configuration_ufrnn import RecallConfig
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy
-from lerobot_ufrnn.recall import REST_STEPS
 
 
 def make_trained(dataset, **overrides) -> UFRNNPolicy:
@@ -114,8 +115,8 @@ def test_the_baselines_run_in_the_same_code(dataset):
 
 
 @pytest.mark.parametrize("exploration", ["foresight", "noise", "none"])
-def test_with_recall_a_policy_that_is_never_surprised_acts_without_noise(dataset, exploration):
-    calm = make_trained(dataset, exploration=exploration, recall={"surprise_threshold": 1e30})
+def test_with_recall_a_policy_that_is_never_contradicted_acts_without_noise(dataset, exploration):
+    calm = make_trained(dataset, exploration=exploration, recall={"stay": 1e9, "strange": 1e9})
     plain = make_trained(dataset, exploration="none", recall={"enabled": False})
     plain.load_state_dict(calm.state_dict())
     for _ in range(15):
@@ -124,12 +125,15 @@ def test_with_recall_a_policy_that_is_never_surprised_acts_without_noise(dataset
     assert calm.recall.events == [[], []]
 
 
-def test_with_recall_a_surprised_policy_goes_back_until_it_is_reset(dataset):
-    policy = make_trained(dataset, recall={"surprise_threshold": 1.01, "num_samples": 5})
-    far = observation(1)
-    far["observation.state"] += 5
+@pytest.mark.parametrize("enabled", [True, False])
+def test_an_arm_that_is_held_where_ways_part_goes_back_until_it_is_reset_unless_told_not_to(dataset, enabled):
+    policy = make_trained(dataset, recall={"enabled": enabled})
+    remember_ways(policy, observation(1)["observation.state"][0])
     for _ in range(20):
-        assert torch.isfinite(policy.select_action(far)).all()
+        assert torch.isfinite(policy.select_action(observation(1))).all()
+    if not enabled:
+        assert policy.recall is None
+        return
     assert policy.recall.events[0]
     policy.reset()
     assert not policy.recall.events
@@ -286,33 +290,6 @@ def test_training_holds_the_last_moment_on(dataset):
     assert torch.equal(commands, policy.joint_scaler.scale(episode.actions[-1]).expand(3, -1))
 
 
-def test_training_remembers_where_each_demonstration_began_and_ended_and_a_checkpoint_keeps_it(dataset, tmp_path):
-    policy = make_policy(small_config(), ds_meta=dataset.meta)
-    policy.eval().forward(batch_of(0))
-    assert not policy.rest.places.any()  # only training learns
-    train(policy, [batch_of(0, 1), batch_of(1, 2)])
-    both = torch.cat([policy.episodes[index].states[[0, -1]] for index in range(3)])
-    expected = {tuple(row) for row in policy.joint_scaler.scale(both).tolist()}
-    policy.save_pretrained(tmp_path)
-    for remembered in (policy, type(policy).from_pretrained(tmp_path)):
-        assert {tuple(row) for row in remembered.rest.places.tolist()} == expected
-
-
-@pytest.mark.parametrize("at_rest", [True, False])
-def test_a_policy_goes_back_from_a_rest_unless_told_not_to(dataset, at_rest):
-    policy = make_policy(small_config(recall={"at_rest": at_rest, "surprise_threshold": 1e9}), ds_meta=dataset.meta)
-    train(policy, [batch_of(0, 1, 2)] * 3)
-    line = torch.linspace(0, 5, 100).unsqueeze(1).expand(-1, 3)
-    policy.rest.observe(line)  # it went far from all that follows
-    policy.rest.least_movement.copy_(torch.tensor(1.0))
-    policy.rest.places.copy_(line[-1:])
-    policy.eval().reset()
-    still = observation(2)
-    for _ in range(REST_STEPS + 1):
-        policy.select_action(still)
-    assert [len(events) for events in policy.recall.events] == [int(at_rest)] * 2
-
-
 def test_commands_that_lead_nowhere_near_are_learned_all_the_same(tmp_path):
     """A gripper that squeezes is commanded far from where it will be measured."""
 
@@ -458,6 +435,33 @@ def test_a_checkpoint_acts_as_the_policy_that_wrote_it(trained, tmp_path):
         policy.actions = [policy.select_action(observation()) for _ in range(3)]
     for ours, theirs in zip(trained.actions, loaded.actions, strict=True):
         assert torch.equal(ours, theirs)
+
+
+def test_a_checkpoint_without_memory_acts_as_sh_rnn_and_says_so(trained, tmp_path, caplog):
+    trained.save_pretrained(tmp_path)
+    file = tmp_path / "model.safetensors"
+    weights = {key: value for key, value in load_file(file).items() if not key.startswith("demonstrations.")}
+    save_file(weights, file)
+    loaded = UFRNNPolicy.from_pretrained(tmp_path)
+    assert "holds no memory of demonstrations" in caplog.text
+    plain = UFRNNPolicy(replace(trained.config, exploration="none", recall=RecallConfig(enabled=False)))
+    plain.load_state_dict(loaded.state_dict())
+    for _ in range(20):
+        assert torch.equal(loaded.select_action(observation()), plain.eval().select_action(observation()))
+    assert loaded.recall.events == []
+
+
+def test_only_the_memory_may_have_another_size_or_be_missing(trained, tmp_path):
+    trained.save_pretrained(tmp_path)
+    file = tmp_path / "model.safetensors"
+    weights = load_file(file)
+    for change, message in (
+        ({"joint_scaler.low": torch.zeros(2)}, r"joint_scaler.low has shape \(2,\) instead of \(3,\)"),
+        ({"demonstration": torch.zeros(2)}, "unknown demonstration"),
+    ):
+        save_file(weights | change, file)
+        with pytest.raises(ValueError, match=message):
+            UFRNNPolicy.from_pretrained(tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a safetensors file", b"\x10\x00\x00\x00\x00\x00\x00\x00{broken"])

@@ -24,8 +24,8 @@ def trial_of(*imaginations: Imagination, first_try: int | None = None) -> TrialH
 
 
 def test_with_recall_the_last_return_was_decisive():
-    likeness = np.linspace(0, 1, CANDIDATES)
-    returns = [Imagination(step, 3, futures_that_part_by(60 - step), 0, likeness) for step in (20, 40)]
+    refuted = np.linspace(0, 1, CANDIDATES)
+    returns = [Imagination(step, 3, futures_that_part_by(60 - step), 0, refuted) for step in (20, 40)]
     assert decisive(trial_of(*returns, first_try=10), 3) is returns[1]
 
 

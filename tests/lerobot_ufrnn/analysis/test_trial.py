@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.policies.factory import make_policy
-from small import JOINTS, batch_of, small_config, train
+from small import JOINTS, batch_of, remember_ways, small_config, train
 
 from lerobot_ufrnn.analysis.hidden_states import read_demonstrations, states_along
 from lerobot_ufrnn.analysis.trial import Attempt, TrialHistory, run_trial
@@ -75,16 +75,20 @@ def test_a_trial_is_kept_step_by_step(dataset, exploration):
     )
 
 
-def test_with_recall_what_is_imagined_is_kept_of_the_steps_that_surprised(dataset):
-    policy = trained(dataset, "foresight", recall={"horizon": 9, "commitment": 4})
-    policy.recall.config.surprise_threshold = 0.01  # so little trained, it expects to be wrong
-    history = run_trial(policy, Playback(dataset, {}), seed=0)
+def test_with_recall_what_is_imagined_is_kept_of_the_steps_at_which_it_went_back(dataset):
+    policy = trained(dataset, "foresight", recall={"horizon": 0.9})
+    door = Playback(dataset, {})
+    door.frames = door.frames[:1] * 40  # it is held where it begins
+    remember_ways(policy, door.frames[0]["observation.state"])
+    history = run_trial(policy, door, seed=0)
     events = policy.recall.events[0]
-    assert events
+    assert len(events) > 1
     assert [imagined.step for imagined in history.imaginations] == [event.step for event in events] == history.returns
     for imagined, event in zip(history.imaginations, events, strict=True):
-        assert imagined.futures.mean.shape[:2] == (9, policy.config.recall.num_samples)
+        assert imagined.futures.mean.shape[:2] == (9, len(event.demonstrations))
         assert imagined.chosen == event.chosen
+        assert imagined.ahead == 2 + event.moments_back
+        np.testing.assert_array_equal(imagined.refuted, event.refuted)
 
 
 @pytest.mark.parametrize("film", [False, True])
