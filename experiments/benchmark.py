@@ -37,7 +37,6 @@ from torch import Tensor
 from env_door.checks import check_range
 from lerobot_ufrnn.analysis.results import markdown
 from lerobot_ufrnn.configuration_ufrnn import AutoencoderConfig, ForesightConfig, RecallConfig, UFRNNConfig
-from lerobot_ufrnn.demonstrations import MOST_MOMENTS, Demonstrations
 from lerobot_ufrnn.foresight import UFRNN
 from lerobot_ufrnn.kernels.unroll import FastUFRNN
 from lerobot_ufrnn.modeling_ufrnn import UFRNNPolicy

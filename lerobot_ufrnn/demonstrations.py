@@ -167,9 +167,13 @@ class Moments:
             return to_each.sort(dim=-1).values[:, rank - 1]
 
         half_step = torch.cat([torch.cat((step, step[-1:] if len(step) else step.new_zeros(1))) / 2 for step in steps])
-        extent = float((all_joints.amax(0) - all_joints.amin(0)).norm())
-        near = max(pace, min(float(to_neighbour(gaps).quantile(0.75)), FARTHEST_NEAR * extent))
-        differences = to_neighbour(looks.masked_fill(gaps >= near, math.inf))
+        most = FARTHEST_NEAR * float((all_joints.amax(0) - all_joints.amin(0)).norm())
+        for rank in range(min(NEIGHBOURS, len(joints) - 1), 0, -1):
+            near = float(to_neighbour(gaps, rank).quantile(0.75))
+            if near <= most:
+                break  # of fewer demonstrations a way, those farther off go another way
+        near = max(pace, min(near, most))
+        differences = to_neighbour(looks.masked_fill(gaps >= near, math.inf), rank)
         differences = differences[differences.isfinite()]
         change = float(torch.cat([(part[1:, dim:] - part[:-1, dim:]).norm(dim=-1) for part in parts]).median())
         alike = max(float(differences.quantile(0.95)) if len(differences) else 0.0, change, 1e-6)

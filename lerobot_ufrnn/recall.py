@@ -228,18 +228,14 @@ class Recall:
         episode.stayed, episode.strange, episode.plan = 0, 0, None
         episode.no_progress, episode.least_left = 0, 1 << 30
         while True:
-            ways_part, passing = False, None
+            ways_part = False
             for at in range(len(trail.sensed) - 1, -1, -max(1, len(trail.sensed) // 50)):
-                near = trail.near(at)
-                if passing is not None and torch.equal(near, passing):
-                    continue  # where the same demonstrations passed later, none left for good
-                passing = near
                 against = self._refute(trail, at, tried)
                 if against is None:
                     continue
                 ways_part = True
                 refuted = episode.refuted + weight * against
-                is_open = near & (refuted < episode.rounds + REFUTED)
+                is_open = trail.near(at) & (refuted < episode.rounds + REFUTED)
                 if is_open.any():
                     episode.refuted = refuted
                     return self._take(episode, reason, trail, at, is_open.nonzero()[:, 0])
@@ -311,7 +307,7 @@ class Recall:
         # Of the demonstrations that go its way, one whose scene is as near as any: objects may have moved.
         same = self.moments.same_way(int(candidates[best]), int(at[best]), math.inf)[candidates] > REFUTED
         same &= torch.tensor([key[:2] == keys[best][:2] for key in keys], device=same.device)
-        same &= looks <= looks[same].min() + 0.5 * self.moments.alike
+        same &= looks <= looks[same].min() + self.moments.alike
         return int(unsure.masked_fill(~same, math.inf).argmin()), futures
 
     def _retrace(self, plan: _Plan, joints: Tensor) -> Tensor | None:

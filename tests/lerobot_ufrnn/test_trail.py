@@ -165,16 +165,6 @@ def test_the_demonstration_that_was_taken_over_is_more_likely(fork):
     assert trail.aligned().followed(6)[4] == pytest.approx(1 / 6, abs=1e-3)  # it was taken over only later
 
 
-def test_demonstrations_go_the_same_way_as_far_as_the_arm_went_and_a_little_further(fork):
-    joints = [*TRUNK[:6], *[TRUNK[5]] * 5]
-    trail = trail_of(fork, joints).aligned()
-    # From 0.2 on: 0.3 were gone and 4 x 0.1 are looked ahead, up to 0.9, before the fork.
-    assert trail.same_way(2, [0]).tolist() == [[pytest.approx(1, abs=0.01)]] * 6
-    gone = trail_of(fork, [*TRUNK, *line((1, 0), ENDS[0], 14)]).aligned()
-    same = gone.same_way(9, [0, 4])
-    np.testing.assert_allclose(same, [[1, 0]] * 2 + [[0, 0]] * 2 + [[0, 1]] * 2, atol=0.01)
-
-
 # ── Back ──────────────────────────────────────────────────────────────
 
 
