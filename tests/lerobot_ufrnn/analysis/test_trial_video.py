@@ -15,7 +15,7 @@ def filmed(success: bool) -> TrialHistory:
 
 @pytest.mark.parametrize("success", [True, False])
 def test_captions_tell_what_is_tried_and_when_it_goes_back_from_the_picture_after_that_step(success):
-    waits, push, back, pull = "push, pull or slide?", "tries to push", "surprised: goes back", "tries to pull"
+    waits, push, back, pull = "push, pull or slide?", "tries to push", "contradicted: goes back", "tries to pull"
     expected = [waits, waits, push, push, back, back, pull, pull]
     assert captions(filmed(success)) == [*expected, "opened" if success else pull]
 

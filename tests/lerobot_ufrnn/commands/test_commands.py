@@ -150,7 +150,7 @@ def test_stock_training_resumes_and_stock_evaluation_reports_each_door(demonstra
 
     picture = ["foresight", f"--policy_path={run / last}", f"--output={tmp_path / 'f.png'}", "--num_steps=6"]
     assert main(picture) == 1  # this one has nothing to remember yet when the trial ends
-    assert "never surprised" in capsys.readouterr().err
+    assert "never contradicted" in capsys.readouterr().err
     config = json.loads((run / last / "config.json").read_text())
     (run / last / "config.json").write_text(json.dumps(config | {"recall": {"enabled": False}}))
     assert main(picture) == 0
