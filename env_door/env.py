@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from env_door.checks import check_choice, check_range
 from env_door.kinematics import InverseKinematics
-from env_door.latch import KINDS, Latch
+from env_door.latch import EIGHT_KINDS, KINDS, Latch
 from env_door.limits import FPS, IMAGE_SIZE, MAX_OFFSET, check_door
 from env_door.rendering import Renderer, make_renderer
 from env_door.scene import ARMS, GRIPPER_STROKE, load_model
@@ -37,6 +37,10 @@ class DoorEnv(gym.Env):
 
     The door opens by pushing, pulling or sliding. Nothing that can be seen or felt says which until the knob is twisted
     and the door is loaded in some direction; a wrong try leaves it shut.
+
+    Harder kinds make it one of eight: it slides to the robot's left (`slide`) or right (`slide_right`), and the knob
+    turns clockwise as the robot sees it or, with a name that ends in `_ccw`, counter-clockwise. A knob that is turned
+    the wrong way is stopped.
 
     ## Action Space
 
@@ -72,14 +76,17 @@ class DoorEnv(gym.Env):
 
     ## Info
 
-    `is_success`, `door_kind`, `opening` (0 closed, 1 open), `attempts` (directions in which the shut door was tried, in
-    order), `held` (somebody holds it now), `tried_while_held` (ways other than its own tried meanwhile).
+    `is_success`, `door_kind`, `opening` (0 closed, 1 open), `attempts` (directions in which the shut door was tried,
+    and turns that the knob stopped, `turn_cw` or `turn_ccw`, in order), `held` (somebody holds it now),
+    `tried_while_held` (ways other than its own tried meanwhile).
 
     ## Arguments
 
     | Argument           | Default       | What                                                                     |
     |--------------------|---------------|--------------------------------------------------------------------------|
-    | `kind`             | `"random"`    | `"push"`, `"pull"`, `"slide"`, or `"random"`: drawn at every reset       |
+    | `kind`             | `"random"`    | `"push"`, `"pull"`, `"slide"`, or `"random"`: one of these is drawn at   |
+    |                    |               | every reset; also `"slide_right"`, `"push_ccw"`, `"pull_ccw"`,           |
+    |                    |               | `"slide_ccw"` and `"slide_right_ccw"`                                    |
     | `arm`              | `"ur5e"`      | `"ur5e"` (6 joints) or `"panda"` (7 joints)                              |
     | `door_offset`      | `0.0`         | half-width in m, 0 to 0.05, of the range of the door's sideways shift    |
     | `start_variation`  | `0.02`        | half-width in m, 0 to 0.05, of the tool's start position along each axis |
@@ -117,7 +124,7 @@ class DoorEnv(gym.Env):
         asked = SimpleNamespace(**locals())
         with _as_value_error():
             check_door(asked)
-            check_choice(asked, "kind", (*KINDS, "random"))
+            check_choice(asked, "kind", (*EIGHT_KINDS, "random"))
             check_range(asked, "observation_size", "render_size", low=16, high=768, unit="pixels")
             check_choice(asked, "render_mode", self.metadata["render_modes"])
         self.kind = kind
@@ -174,7 +181,7 @@ class DoorEnv(gym.Env):
             raise ValueError(f"unknown reset options {sorted(options)}; 'kind' and 'door_offset' are known")
         asked = SimpleNamespace(kind=kind, door_offset=offset)
         with _as_value_error():
-            check_choice(asked, "kind", (*KINDS, "random"))
+            check_choice(asked, "kind", (*EIGHT_KINDS, "random"))
             check_range(asked, "door_offset", low=-MAX_OFFSET, high=MAX_OFFSET, unit="m")
 
         mujoco.mj_resetData(self.model, self.data)
