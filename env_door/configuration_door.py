@@ -86,7 +86,9 @@ class DoorEnvConfig(EnvConfig):
     def gym_kwargs(self) -> dict[str, Any]:
         """Keywords of `gym.make`, but for the kind of the door."""
         names = ("arm", "door_offset", "start_variation", "command_limit", "hold_seconds", "disable_env_checker")
-        return {name: getattr(self, name) for name in names} | {"max_episode_steps": self.episode_length}
+        settings = {name: getattr(self, name) for name in names}
+        eight = not {*self.kinds} <= {*KINDS, "random"}
+        return settings | {"max_episode_steps": self.episode_length, "eight": eight}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """Make the vector environments, one suite for each kind of door: `door_push`, `door_pull` and so on."""

@@ -87,6 +87,8 @@ class DoorEnv(gym.Env):
     | `kind`             | `"random"`    | `"push"`, `"pull"`, `"slide"`, or `"random"`: one of these is drawn at   |
     |                    |               | every reset; also `"slide_right"`, `"push_ccw"`, `"pull_ccw"`,           |
     |                    |               | `"slide_ccw"` and `"slide_right_ccw"`                                    |
+    | `eight`            | `False`       | whether the door is one of all eight kinds: `"random"` draws from them,  |
+    |                    |               | and `attempts` tells them apart; a kind beyond the three always is       |
     | `arm`              | `"ur5e"`      | `"ur5e"` (6 joints) or `"panda"` (7 joints)                              |
     | `door_offset`      | `0.0`         | half-width in m, 0 to 0.05, of the range of the door's sideways shift    |
     | `start_variation`  | `0.02`        | half-width in m, 0 to 0.05, of the tool's start position along each axis |
@@ -120,6 +122,7 @@ class DoorEnv(gym.Env):
         observation_size: int = IMAGE_SIZE,
         render_size: int = 192,
         render_mode: str = "rgb_array",
+        eight: bool = False,
     ):
         asked = SimpleNamespace(**locals())
         with _as_value_error():
@@ -128,6 +131,7 @@ class DoorEnv(gym.Env):
             check_range(asked, "observation_size", "render_size", low=16, high=768, unit="pixels")
             check_choice(asked, "render_mode", self.metadata["render_modes"])
         self.kind = kind
+        self.eight = eight
         self.arm = ARMS[arm]
         self.door_offset = door_offset
         self.start_variation = start_variation
@@ -172,7 +176,8 @@ class DoorEnv(gym.Env):
         super().reset(seed=seed)
         options = dict(options or {})
         # Always the same draws in the same order, whatever is overridden: seeds stay comparable across kinds.
-        drawn_kind = KINDS[self.np_random.integers(len(KINDS))]
+        kinds = EIGHT_KINDS if self.eight else KINDS
+        drawn_kind = kinds[self.np_random.integers(len(kinds))]
         drawn_offset = self.np_random.uniform(-1.0, 1.0) * self.door_offset
         start_shift = self.np_random.uniform(-1.0, 1.0, size=3) * self.start_variation
         kind = options.pop("kind", self.kind)
@@ -185,7 +190,7 @@ class DoorEnv(gym.Env):
             check_range(asked, "door_offset", low=-MAX_OFFSET, high=MAX_OFFSET, unit="m")
 
         mujoco.mj_resetData(self.model, self.data)
-        self.latch.reset(drawn_kind if kind == "random" else kind)
+        self.latch.reset(drawn_kind if kind == "random" else kind, self.eight)
         self._to_be_held = self.hold_seconds > 0
         self.current_offset = float(offset)
         self.model.body_pos[self._doorway] = self._doorway_home + np.array([0.0, self.current_offset, 0.0])

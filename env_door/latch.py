@@ -92,14 +92,19 @@ class Latch:
         self._closed_ranges = {joint: model.jnt_range[i].copy() for joint, i in self._joint.items()}
         self.reset("push")
 
-    def reset(self, kind: str) -> None:
-        """Closes and locks the door, and makes it one of the given kind. Call after `mujoco.mj_resetData`."""
+    def reset(self, kind: str, eight: bool = False) -> None:
+        """Closes and locks the door, and makes it one of the given kind. Call after `mujoco.mj_resetData`.
+
+        `eight`, or a kind beyond the three, tells tries of all eight kinds apart and notes wrong turns of the knob.
+        """
         self.kind = kind
+        self._is_one_of_eight = eight or kind not in KINDS
         self.freed = False
         self.attempts: tuple[str, ...] = ()
         self.tried_while_held: tuple[str, ...] = ()
         self._turn = OPENINGS[kind].turn
-        self._directions = [name for name, opening in OPENINGS.items() if opening.turn == self._turn]
+        among = EIGHT_KINDS if self._is_one_of_eight else KINDS
+        self._directions = [name for name in among if OPENINGS[name].turn == self._turn]
         self._loaded_steps = dict.fromkeys(self._directions, 0)
         self._pressed_steps = 0
         self._held_steps = 0
@@ -191,7 +196,7 @@ class Latch:
             return
         if pressed == self._turn:
             self._set_knob(self._turn, self._knob_end)
-        elif not self.freed:
+        elif self._is_one_of_eight and not self.freed:
             self.attempts = _with(self.attempts, TURNS[pressed])
 
     def _set_knob(self, turn: int, end: float) -> None:

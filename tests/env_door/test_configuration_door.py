@@ -12,7 +12,7 @@ from lerobot.scripts.lerobot_eval import rollout
 
 from env_door.configuration_door import DoorEnvConfig
 from env_door.expert import DoorExpert
-from env_door.latch import EIGHT_KINDS
+from env_door.latch import EIGHT_KINDS, KINDS
 from env_door.trials import read_trials
 
 
@@ -126,7 +126,9 @@ def test_the_environment_takes_the_extremes_that_the_configuration_allows(make, 
     ],
 )
 def test_each_kind_has_a_suite_of_its_own(make, task, wanted):
-    kinds = {name: env.reset(seed=0)[1]["door_kind"][0] for name, env in make(task=task).items()}
+    suites = make(task=task)
+    kinds = {name: env.reset(seed=0)[1]["door_kind"][0] for name, env in suites.items()}
+    assert {env.get_attr("eight")[0] for env in suites.values()} == {not set(wanted) <= set(KINDS)}
     assert list(kinds.items()) == [(f"door_{kind}", kind) for kind in wanted]
 
 

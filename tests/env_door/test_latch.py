@@ -22,7 +22,7 @@ class Door(Latch):
         self.model = load_model("ur5e")
         self.data = mujoco.MjData(self.model)
         super().__init__(self.model, self.data)
-        self.reset(kind)
+        self.reset(kind, eight=True)
         self.turn = OPENINGS[kind].turn
 
     def press(self, direction, load, steps=LOAD_STEPS + 60, twist=0.9):
@@ -115,6 +115,17 @@ def test_load_is_what_was_applied(kind):
     door.data.joint(opening.joint).qfrc_applied = opening.sign * 0.8 * opening.break_load
     mujoco.mj_step(door.model, door.data)
     assert door.load(kind) == pytest.approx(0.8, rel=0.05)
+
+
+def test_a_door_that_is_one_of_three_notes_no_tries_of_the_others():
+    door = Door("pull")
+    door.reset("pull")
+    door.twist(-8.0)
+    door.press("slide_right", 3.0)
+    assert door.attempts == ()
+    door.press("slide", 1.5)
+    door.press("pull", 1.5)
+    assert door.attempts == ("slide", "pull")
 
 
 def test_short_shock_does_not_free():
