@@ -11,13 +11,14 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from env_door.checks import check_range
-from env_door.latch import KINDS
+from env_door.latch import EIGHT_KINDS, KINDS
 from env_door.limits import EPISODE_STEPS, FPS, IMAGE_SIZE, check_door
 from env_door.scene import ARMS
 from env_door.suites import WithoutRolloutOption, make_suites
 from env_door.trials import TrialLog
 
-TASKS = (*KINDS, "random", "all")
+SETS = {"all": KINDS, "eight": EIGHT_KINDS}
+TASKS = (*EIGHT_KINDS, "random", *SETS)
 
 
 def make_door(*, trial_log: str | None, **env_kwargs: Any) -> gym.Env:
@@ -32,8 +33,8 @@ class DoorEnvConfig(EnvConfig):
     """Configuration of the door environment for `lerobot-eval` and `lerobot-train`."""
 
     task: str | None = "all"
-    """Kind of door: push, pull, slide or random (drawn at each reset). Several, such as push,pull or all, are evaluated
-    one after the other, each reported by itself."""
+    """Kind of door: push, pull, slide or random (one of these, drawn at each reset). Several, such as push,pull or all,
+    are evaluated one after the other, each reported by itself. eight: also slide_right, and these four with _ccw."""
     fps: int = FPS
     """Control steps a second; the environment runs at no other rate."""
     episode_length: int = EPISODE_STEPS
@@ -56,7 +57,7 @@ class DoorEnvConfig(EnvConfig):
     )
 
     def __post_init__(self) -> None:
-        if self.task not in TASKS and sorted(self.kinds) != sorted(set(self.kinds) & set(KINDS)):
+        if self.task not in TASKS and sorted(self.kinds) != sorted(set(self.kinds) & set(EIGHT_KINDS)):
             raise ParsingError(
                 f"--env.task must be one of {', '.join(TASKS)}, or several kinds such as push,pull, got {self.task!r}."
             )
@@ -78,13 +79,16 @@ class DoorEnvConfig(EnvConfig):
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of door, one suite each."""
-        return KINDS if self.task == "all" else tuple(kind.strip() for kind in str(self.task).split(","))
+        task = str(self.task)
+        return SETS[task] if task in SETS else tuple(kind.strip() for kind in task.split(","))
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Keywords of `gym.make`, but for the kind of the door."""
         names = ("arm", "door_offset", "start_variation", "command_limit", "hold_seconds", "disable_env_checker")
-        return {name: getattr(self, name) for name in names} | {"max_episode_steps": self.episode_length}
+        settings = {name: getattr(self, name) for name in names}
+        eight = not {*self.kinds} <= {*KINDS, "random"}
+        return settings | {"max_episode_steps": self.episode_length, "eight": eight}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """Make the vector environments, one suite for each kind of door: `door_push`, `door_pull` and so on."""

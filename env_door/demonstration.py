@@ -22,7 +22,7 @@ class Demonstration:
     images: np.ndarray  # (T, H, W, 3), uint8
     states: np.ndarray  # (T, D), measured joints in rad, the gripper last in 0..1
     actions: np.ndarray  # (T, D), joint targets applied at the frame of the same index
-    branch_step: int  # first step whose action depends on the kind
+    branch_step: int  # first step whose action depends on the kind, among those with the same turn of the knob
     success_step: int  # first step after which the door counted as open
 
 
@@ -40,8 +40,8 @@ def demonstrate(
 ) -> Demonstration | None:
     """Let the expert open a door and hold it open to the last step; `None` if it opens too late or is out of reach.
 
-    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`. Without
-    a `door_offset` in m the environment draws where the door stands.
+    Everything random hangs on `seed` alone, so that two kinds with the same seed are alike up to `branch_step`, or
+    to the twist if they turn the knob unlike. Without a `door_offset` in m the environment draws where the door stands.
     """
     options = {"kind": kind} if door_offset is None else {"kind": kind, "door_offset": door_offset}
     observation, _ = env.reset(seed=seed, options=options)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from env_door.checks import check_choice, check_range
 from env_door.kinematics import InverseKinematics
-from env_door.latch import KINDS, Latch
+from env_door.latch import EIGHT_KINDS, KINDS, Latch
 from env_door.limits import FPS, IMAGE_SIZE, MAX_OFFSET, check_door
 from env_door.rendering import Renderer, make_renderer
 from env_door.scene import ARMS, GRIPPER_STROKE, load_model
@@ -37,6 +37,10 @@ class DoorEnv(gym.Env):
 
     The door opens by pushing, pulling or sliding. Nothing that can be seen or felt says which until the knob is twisted
     and the door is loaded in some direction; a wrong try leaves it shut.
+
+    Harder kinds make it one of eight: it slides to the robot's left (`slide`) or right (`slide_right`), and the knob
+    turns clockwise as the robot sees it or, with a name that ends in `_ccw`, counter-clockwise. A knob that is turned
+    the wrong way is stopped.
 
     ## Action Space
 
@@ -72,14 +76,19 @@ class DoorEnv(gym.Env):
 
     ## Info
 
-    `is_success`, `door_kind`, `opening` (0 closed, 1 open), `attempts` (directions in which the shut door was tried, in
-    order), `held` (somebody holds it now), `tried_while_held` (ways other than its own tried meanwhile).
+    `is_success`, `door_kind`, `opening` (0 closed, 1 open), `attempts` (directions in which the shut door was tried,
+    and turns that the knob stopped, `turn_cw` or `turn_ccw`, in order), `held` (somebody holds it now),
+    `tried_while_held` (ways other than its own tried meanwhile).
 
     ## Arguments
 
     | Argument           | Default       | What                                                                     |
     |--------------------|---------------|--------------------------------------------------------------------------|
-    | `kind`             | `"random"`    | `"push"`, `"pull"`, `"slide"`, or `"random"`: drawn at every reset       |
+    | `kind`             | `"random"`    | `"push"`, `"pull"`, `"slide"`, or `"random"`: one of these is drawn at   |
+    |                    |               | every reset; also `"slide_right"`, `"push_ccw"`, `"pull_ccw"`,           |
+    |                    |               | `"slide_ccw"` and `"slide_right_ccw"`                                    |
+    | `eight`            | `False`       | whether the door is one of all eight kinds: `"random"` draws from them,  |
+    |                    |               | and `attempts` tells them apart; a kind beyond the three always is       |
     | `arm`              | `"ur5e"`      | `"ur5e"` (6 joints) or `"panda"` (7 joints)                              |
     | `door_offset`      | `0.0`         | half-width in m, 0 to 0.05, of the range of the door's sideways shift    |
     | `start_variation`  | `0.02`        | half-width in m, 0 to 0.05, of the tool's start position along each axis |
@@ -113,14 +122,16 @@ class DoorEnv(gym.Env):
         observation_size: int = IMAGE_SIZE,
         render_size: int = 192,
         render_mode: str = "rgb_array",
+        eight: bool = False,
     ):
         asked = SimpleNamespace(**locals())
         with _as_value_error():
             check_door(asked)
-            check_choice(asked, "kind", (*KINDS, "random"))
+            check_choice(asked, "kind", (*EIGHT_KINDS, "random"))
             check_range(asked, "observation_size", "render_size", low=16, high=768, unit="pixels")
             check_choice(asked, "render_mode", self.metadata["render_modes"])
         self.kind = kind
+        self.eight = eight
         self.arm = ARMS[arm]
         self.door_offset = door_offset
         self.start_variation = start_variation
@@ -165,7 +176,8 @@ class DoorEnv(gym.Env):
         super().reset(seed=seed)
         options = dict(options or {})
         # Always the same draws in the same order, whatever is overridden: seeds stay comparable across kinds.
-        drawn_kind = KINDS[self.np_random.integers(len(KINDS))]
+        kinds = EIGHT_KINDS if self.eight else KINDS
+        drawn_kind = kinds[self.np_random.integers(len(kinds))]
         drawn_offset = self.np_random.uniform(-1.0, 1.0) * self.door_offset
         start_shift = self.np_random.uniform(-1.0, 1.0, size=3) * self.start_variation
         kind = options.pop("kind", self.kind)
@@ -174,11 +186,11 @@ class DoorEnv(gym.Env):
             raise ValueError(f"unknown reset options {sorted(options)}; 'kind' and 'door_offset' are known")
         asked = SimpleNamespace(kind=kind, door_offset=offset)
         with _as_value_error():
-            check_choice(asked, "kind", (*KINDS, "random"))
+            check_choice(asked, "kind", (*EIGHT_KINDS, "random"))
             check_range(asked, "door_offset", low=-MAX_OFFSET, high=MAX_OFFSET, unit="m")
 
         mujoco.mj_resetData(self.model, self.data)
-        self.latch.reset(drawn_kind if kind == "random" else kind)
+        self.latch.reset(drawn_kind if kind == "random" else kind, self.eight)
         self._to_be_held = self.hold_seconds > 0
         self.current_offset = float(offset)
         self.model.body_pos[self._doorway] = self._doorway_home + np.array([0.0, self.current_offset, 0.0])

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from env_door.env import GRASP_ROTATION, DoorEnv
 from env_door.kinematics import rotation_about
-from env_door.latch import KINDS, OPENINGS
+from env_door.latch import EIGHT_KINDS, OPENINGS, TURNS
 from env_door.scene import GRIPPER_STROKE
 
 TWIST_ANGLE = 0.95  # of the knob in rad
+PROBE_ANGLE = 0.3  # twist of the tool in rad when a turn of the knob is only tried
+PRESS_ANGLE = 0.08  # twist of the tool in rad that presses the knob against its stop until that gives way
 GRASP_CLOSURE = 1.0 - (0.028 - 0.005) / GRIPPER_STROKE
 """Gripper target on the knob's 28 mm bar: 5 mm tighter gives full grip force, yet stays near what is measured."""
 
@@ -25,11 +27,7 @@ HINGE_FROM_KNOB = np.array([0.086, 0.34, 0.0])  # from the knob to the hinge's a
 OPEN_TRAVEL = {"hinge": 0.52, "slide": 0.19}  # of the door at the end of the opening motion, in rad or m
 PROBE_DISTANCE = 0.03  # travel of the tool in m when a direction is only tried
 
-TRY_AXES = {
-    "push": np.array([1.0, 0.0, 0.0]),
-    "pull": np.array([-1.0, 0.0, 0.0]),
-    "slide": np.array([0.0, 1.0, 0.0]),
-}
+TRY_AXES = {"hinge": np.array([1.0, 0.0, 0.0]), "slide": np.array([0.0, 1.0, 0.0])}
 """Along which axis a try moves the tool. Unlike the opening motion a try does not turn the tool with the door: turned
 against a door that stays shut, the pads would slip on the knob and load it the other way on the return."""
 
@@ -38,6 +36,8 @@ PHASE_STEPS = {
     "advance": (9, 11),
     "grasp": (7, 8),
     "twist": (19, 21),
+    "untwist": (19, 21),
+    "press": (5, 6),
     "try": (7, 9),
     "return": (8, 10),
     "open": (42, 48),
@@ -53,7 +53,7 @@ class Waypoint:
     """Tool position relative to the closed door's knob in m, before any opening motion, shape `(3,)`."""
     twist: float = 0.0  # of the gripper about the knob's axis in rad
     gripper: float = 0.0  # target, 0 open to 1 closed
-    travel: float = 0.0  # of the door its own way, in rad (push, pull) or m (slide)
+    travel: float = 0.0  # of the door its own way, in rad (hinge) or m (slide)
     direction: str = "push"
 
     def towards(self, end: "Waypoint", fraction: float) -> "Waypoint":
@@ -82,12 +82,13 @@ class Waypoint:
 class DoorExpert:
     """Opens the door of an unwrapped environment; knows the knob's place, but not the kind.
 
-    Tries the `directions` in order, each one of `KINDS`, and carries the last one through.
+    Tries the `directions` in order, each one of `EIGHT_KINDS`, and carries the last one through. Of a direction that
+    wants the knob turned other than the last one does, only the turn can be tried.
     """
 
     def __init__(self, env: DoorEnv, directions: Sequence[str] = ("push",)):
-        if not directions or any(direction not in KINDS for direction in directions):
-            raise ValueError(f"directions={tuple(directions)} must name at least one of {KINDS} and nothing else")
+        if not directions or any(direction not in OPENINGS for direction in directions):
+            raise ValueError(f"directions={tuple(directions)} must name at least one of {EIGHT_KINDS} and nothing else")
         self._env = env
         self.directions = tuple(directions)
         self._plan: list[tuple[str, NDArray[np.float32]]] = []
@@ -98,7 +99,7 @@ class DoorExpert:
         """Plans for the present start pose and door place; call after the environment's `reset`.
 
         The duration of every phase is drawn from `rng`: as many draws before the first try whatever the directions, so
-        equal seeds give equal actions up to `branch_step`.
+        equal seeds give equal actions up to the twist, and with the same turn up to `branch_step`, the first try.
 
         Raises:
             UnreachableError: If the arm cannot reach a pose of the plan.
@@ -108,16 +109,16 @@ class DoorExpert:
         joints = self._env.measured_joints()[:-1]
         start = Waypoint(shift=kinematics.forward(joints)[0] - knob)
         self._plan = []
-        self._step = 0
+        self._step = self.branch_step = 0
         for phase, begin, end in self._stages(start):
+            if phase.startswith(("try", "open")) and not self.branch_step:
+                self.branch_step = len(self._plan)
             low, high = PHASE_STEPS[phase.split("_")[0]]
             num_steps = int(rng.integers(low, high + 1))
             for step in range(1, num_steps + 1):
                 waypoint = begin.towards(end, ease(step / num_steps))
                 joints = kinematics.solve(*waypoint.pose(knob), joints)
                 self._plan.append((phase, np.append(joints, waypoint.gripper).astype(np.float32)))
-            if phase == "twist":
-                self.branch_step = len(self._plan)
 
     def act(self) -> NDArray[np.float32]:
         """Action for this control step; the last one again once the plan is done."""
@@ -129,25 +130,40 @@ class DoorExpert:
 
     @property
     def phase(self) -> str:
-        """What `act` does next: approach, advance, grasp, twist, try_<direction>, return, open; hold after the plan."""
+        """What `act` does next: approach, advance, grasp, twist, try_<direction>, return, open; hold after the plan.
+
+        Where the knob may have to be turned counter-clockwise also press, untwist, try_turn_cw and try_turn_ccw.
+        """
         return self._plan[self._step][0] if self._step < len(self._plan) else "hold"
 
     def _stages(self, start: Waypoint) -> list[tuple[str, Waypoint, Waypoint]]:
         standoff = Waypoint(shift=np.array([-STANDOFF, 0.0, 0.0]))
         around = Waypoint()
         grasped = replace(around, gripper=GRASP_CLOSURE)
-        twisted = replace(grasped, twist=TWIST_ANGLE)
-        stages = [
-            ("approach", start, standoff),
-            ("advance", standoff, around),
-            ("grasp", around, grasped),
-            ("twist", grasped, twisted),
-        ]
+        last = OPENINGS[self.directions[-1]]
+        twisted = replace(grasped, twist=last.turn * TWIST_ANGLE)
+        stages = [("approach", start, standoff), ("advance", standoff, around), ("grasp", around, grasped)]
+        twist = [("twist", grasped, twisted)]
+        if last.turn < 0:  # more slowly as long as it may be blocked, so that the commands stay near what is measured
+            pressed = replace(grasped, twist=-PRESS_ANGLE)
+            twist = [("press", grasped, pressed), ("twist", pressed, twisted)]
+        here = grasped
         for direction in self.directions[:-1]:
-            tried = replace(twisted, shift=PROBE_DISTANCE * TRY_AXES[direction])
-            stages += [(f"try_{direction}", twisted, tried), ("return", tried, twisted)]
+            opening = OPENINGS[direction]
+            if opening.turn == last.turn:
+                ready, name = twisted, direction
+                tried = replace(twisted, shift=PROBE_DISTANCE * opening.sign * TRY_AXES[opening.joint])
+            else:
+                ready, name = grasped, TURNS[opening.turn]
+                tried = replace(grasped, twist=opening.turn * PROBE_ANGLE)
+            if here is not ready:
+                stages += twist if ready is twisted else [("untwist", twisted, grasped)]
+            stages += [(f"try_{name}", ready, tried), ("return", tried, ready)]
+            here = ready
+        if here is not twisted:
+            stages += twist
         shut = replace(twisted, direction=self.directions[-1])
-        opened = replace(shut, travel=OPEN_TRAVEL[OPENINGS[shut.direction].joint])
+        opened = replace(shut, travel=OPEN_TRAVEL[last.joint])
         return [*stages, ("open", shut, opened)]
 
 

@@ -106,7 +106,8 @@ class RecordConfig(DatasetConfig):
     """What to record of the door, and where to."""
 
     kinds: list[str] = field(default_factory=lambda: list(KINDS))
-    """Kinds of door to record: push, pull, slide."""
+    """Kinds of door to record: push, pull, slide, and further slide_right, push_ccw, pull_ccw, slide_ccw,
+    slide_right_ccw."""
     arm: str = "ur5e"
     """ur5e or panda."""
     door_offset: float = 0.0

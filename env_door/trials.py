@@ -25,7 +25,7 @@ class Trial:
     door_kind: str  # or in another environment what had to be found out
     success: bool
     steps: int  # control steps taken
-    attempts: tuple[str, ...]  # directions in which the unlatched door was tried, in order
+    attempts: tuple[str, ...]  # directions in which the unlatched door was tried, and turns of the knob, in order
     opening: float = 0.0  # at the end: 0 closed, 1 the success threshold
     door_offset: float = 0.0  # sideways shift in m
     held_at: int | None = None  # first control step, counted from 0, during which somebody held the door

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from env_door.checks import check_choice, check_range
-from env_door.latch import KINDS
+from env_door.latch import EIGHT_KINDS
 from env_door.limits import MAX_HOLD, MAX_OFFSET
 from env_door.twin import ports
 from env_door.twin.arm import TIME_STEP, LiveDoor
@@ -37,7 +37,7 @@ class TwinConfig:
     """IPv4 address to listen on. The ports are fixed, as on a real robot; several twins need several addresses
     (127.0.0.2, 127.0.0.3, ...; Linux has them all). ur_rtde skips its check of remote control on 127.0.0.1."""
     kind: str = "random"
-    """Kind of the door: push, pull, slide or random."""
+    """Kind of the door: push, pull, slide or random, or another of the eight, such as push_ccw."""
     seed: int = 0
     """Seed of the first trial: kind, start pose and the door's shift."""
     door_offset: float = 0.0
@@ -52,7 +52,7 @@ class TwinConfig:
     """Whether the twin ends with the process at the other end of its standard input, which writes nothing there."""
 
     def __post_init__(self) -> None:
-        check_choice(self, "kind", (*KINDS, "random"))
+        check_choice(self, "kind", (*EIGHT_KINDS, "random"))
         check_range(self, "seed", low=0)
         check_range(self, "door_offset", low=0.0, high=MAX_OFFSET, unit="m")
         check_range(self, "hold_seconds", low=0.0, high=MAX_HOLD, unit="s")

@@ -7,8 +7,19 @@ from pathlib import Path
 import matplotlib
 from matplotlib.figure import Figure
 
-DOOR_COLORS = {"push": "#4477aa", "pull": "#ee9955", "slide": "#66aa88"}
-"""Colour of each kind of door, which is also a direction in which one can be tried."""
+DOOR_COLORS = {
+    "push": "#4477aa",
+    "pull": "#ee9955",
+    "slide": "#66aa88",
+    "slide_right": "#aa6699",
+    "push_ccw": "#223b55",
+    "pull_ccw": "#8a5020",
+    "slide_ccw": "#335544",
+    "slide_right_ccw": "#5f3054",
+    "turn_cw": "#888888",
+    "turn_ccw": "#555555",
+}
+"""Colour of each kind of door, which is also a direction in which one can be tried, and of turns of its knob."""
 
 
 @contextmanager

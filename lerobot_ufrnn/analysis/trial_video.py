@@ -18,7 +18,8 @@ WHITE, ALARM = "#ffffff", "#ff7777"
 
 def captions(history: TrialHistory) -> list[str]:
     """What to write below each picture of a filmed trial."""
-    tries, texts, text = dict(history.attempts), [], "push, pull or slide?"
+    tries, texts = dict(history.attempts), []
+    text = "push, pull or slide?" if history.door_kind in ("push", "pull", "slide") else "which way?"
     for step in range(-1, len(history.states)):
         # The picture after a step is the first one that shows what became of it.
         if step in tries:

@@ -24,7 +24,7 @@ class HiddenConfig(DoorTrialConfig):
     labels: list[str] = field(default_factory=list)
     """Names of the policies; those of the paper by default."""
     kind: str = "push"
-    """Kind of the trial's door: `push`, `pull`, `slide` or `random`."""
+    """Kind of the trial's door: `push`, `pull`, `slide` or `random`, or another of the eight."""
     hold_seconds: float = 0.0
     """Interference: time in seconds for which somebody holds the trial's door still once it has begun to open,
     highlighted in the picture."""

@@ -26,7 +26,8 @@ class DoorTrialConfig:
     """Which trial to run; the commands that run one add their own flags."""
 
     kind: str = "any"
-    """Kind of the door: `push`, `pull`, `slide` or `random`; `any` takes the first that shows something."""
+    """Kind of the door: `push`, `pull`, `slide` or `random`, or another of the eight; `any` takes the first of three
+    that shows something."""
     arm: str = "ur5e"
     """`ur5e` or `panda`."""
     door_offset: float = 0.0

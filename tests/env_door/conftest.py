@@ -30,6 +30,16 @@ def env():
     env.close()
 
 
+@pytest.fixture(scope="module")
+def eight():
+    """An environment whose door is one of eight."""
+    from env_door.env import DoorEnv
+
+    env = DoorEnv(door_offset=0.05, eight=True)
+    yield env
+    env.close()
+
+
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory):
     """A small matched recording: its configuration and its report."""

@@ -12,6 +12,7 @@ from lerobot.scripts.lerobot_eval import rollout
 
 from env_door.configuration_door import DoorEnvConfig
 from env_door.expert import DoorExpert
+from env_door.latch import EIGHT_KINDS, KINDS
 from env_door.trials import read_trials
 
 
@@ -75,8 +76,8 @@ def test_type_is_registered_with_its_features(arm, dimension):
 @pytest.mark.parametrize(
     ("field", "value", "allowed"),
     [
-        ("task", "open", "push, pull, slide, random, all"),
-        ("task", None, "push, pull, slide, random, all"),
+        ("task", "open", "push, pull, slide, slide_right, push_ccw, .*, slide_right_ccw, random, all, eight"),
+        ("task", None, "push, pull, slide, .*, random, all, eight"),
         ("task", "", "or several kinds such as push,pull"),
         ("task", "push,lift", "or several kinds such as push,pull"),
         ("task", "push,push", "or several kinds such as push,pull"),
@@ -115,10 +116,19 @@ def test_the_environment_takes_the_extremes_that_the_configuration_allows(make, 
 
 
 @pytest.mark.parametrize(
-    ("task", "wanted"), [("all", ["push", "pull", "slide"]), ("pull, push", ["pull", "push"]), ("slide", ["slide"])]
+    ("task", "wanted"),
+    [
+        ("all", ["push", "pull", "slide"]),
+        ("pull, push", ["pull", "push"]),
+        ("slide", ["slide"]),
+        ("push,slide_right_ccw", ["push", "slide_right_ccw"]),
+        ("eight", [*EIGHT_KINDS]),
+    ],
 )
 def test_each_kind_has_a_suite_of_its_own(make, task, wanted):
-    kinds = {name: env.reset(seed=0)[1]["door_kind"][0] for name, env in make(task=task).items()}
+    suites = make(task=task)
+    kinds = {name: env.reset(seed=0)[1]["door_kind"][0] for name, env in suites.items()}
+    assert {env.get_attr("eight")[0] for env in suites.values()} == {not set(wanted) <= set(KINDS)}
     assert list(kinds.items()) == [(f"door_{kind}", kind) for kind in wanted]
 
 
@@ -164,6 +174,16 @@ def test_rollout_of_lerobot_eval_sees_success_and_failure(tmp_path, make):
     assert trials[0].steps < trials[1].steps < trials[2].steps == 130
     # The steps of the log are those at which the roll-out was done.
     assert [int(done.int().argmax()) + 1 for done in result["done"]] == [trial.steps for trial in trials]
+
+
+def test_rollout_of_lerobot_eval_logs_the_turns_that_the_knob_stopped(tmp_path, make):
+    log = tmp_path / "trials.jsonl"
+    env = make(2, task="pull_ccw", episode_length=130, trial_log=str(log))["door_pull_ccw"]
+    result = run(env, [("pull", "pull_ccw")], seeds=[7, 8])
+    assert result["success"].any(dim=1).tolist() == [True, False]
+    opened, _ = sorted(read_trials(log), key=lambda trial: trial.seed)
+    assert (opened.door_kind, opened.attempts) == ("pull_ccw", ("turn_cw", "pull_ccw"))
+    assert (opened.first_try_wrong, opened.first_try) == (True, False)
 
 
 def test_rollout_of_lerobot_eval_logs_the_hold(tmp_path, make):

@@ -135,6 +135,21 @@ def test_later_frames_leave_no_trace_in_the_video_of_earlier_ones(tmp_path, reco
     assert decoded_difference(RGBEncoderConfig(vcodec="h264", g=50, crf=23)) > 10
 
 
+def test_kinds_that_turn_the_knob_unlike_are_matched_up_to_the_twist(tmp_path):
+    kinds, num_steps = ["slide_right", "push_ccw", "pull_ccw"], 120
+    config = RecordConfig("tester/door", root=tmp_path / "door", episodes_per_kind=1, kinds=kinds, num_steps=num_steps)
+    report = record(config)
+    assert [episode["kind"] for episode in report.episodes] == kinds
+    dataset = open_dataset(config)
+    states = np.stack([dataset[i]["observation.state"] for i in range(3 * num_steps)]).reshape(3, num_steps, -1)
+    grasped = int((states[0, :, -1] > 0.6).argmax())
+    np.testing.assert_array_equal(states[0, : grasped + 1], states[1, : grasped + 1])
+    assert np.abs(states[0, grasped + 20] - states[1, grasped + 20]).max() > 0.5
+    branch = report.episodes[1]["branch_step"]
+    np.testing.assert_array_equal(states[1, : branch + 1], states[2, : branch + 1])
+    assert np.abs(states[1, branch + 20] - states[2, branch + 20]).max() > 0.1
+
+
 def test_panda_has_its_own_joints(tmp_path):
     config = RecordConfig("tester/panda", root=tmp_path / "door", episodes_per_kind=1, kinds=["pull"], arm="panda")
     record(config)

@@ -38,7 +38,7 @@ def test_somebody_holds_the_door_for_a_while(twin, requests):
     [
         ("nonsense", "Expecting value"),
         ('{"do": "dance"}', "must be"),
-        ('{"do": "reset", "kind": "lift"}', "'slide', 'random'"),
+        ('{"do": "reset", "kind": "lift"}', "'slide_right_ccw', 'random'"),
         ('{"do": "reset", "seed": -1}', "not negative"),
         ('{"do": "hold", "seconds": -1}', "negative"),
         ('{"do": "inject", "name": "rain"}', "drop_link"),
