@@ -22,11 +22,11 @@ def find_weights(path: str) -> Path:
 
 
 def read_weights(
-    file: str | Path, expected: dict[str, Tensor], prefix: str = "", of_any_size: str = ""
+    file: str | Path, expected: dict[str, Tensor], prefix: str = "", of_any_size: tuple[str, ...] = ()
 ) -> dict[str, Tensor]:
     """Weights whose names begin with `prefix`, without it; refused unless names and shapes are those `expected`.
 
-    What begins with `of_any_size`, if given, may be there or not, in any shape.
+    What begins with one of `of_any_size` may be there or not, in any shape.
     """
     try:
         weights = load_file(file)
@@ -41,7 +41,7 @@ def read_weights(
     weights = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
     wrong = [f"missing {key}" for key in sorted(expected.keys() - weights.keys())]
     unknown = sorted(weights.keys() - expected.keys())
-    wrong += [f"unknown {key}" for key in unknown if not (of_any_size and key.startswith(of_any_size))]
+    wrong += [f"unknown {key}" for key in unknown if not key.startswith(of_any_size)]
     wrong += [
         f"{key} has shape {tuple(weights[key].shape)} instead of {tuple(expected[key].shape)}"
         for key in sorted(expected.keys() & weights.keys())

@@ -25,6 +25,7 @@ T = TypeVar("T", bound="UFRNNPolicy")
 
 ENCODER_PREFIX = "image_encoder."
 MEMORY_PREFIX = "demonstrations."
+OLD_MEMORY_PREFIX = "rest."  # of version 0.1, which remembered only where demonstrations began and ended
 FPS = 10.0  # control steps a second, unless the data set or the checkpoint says otherwise
 
 
@@ -342,7 +343,7 @@ class UFRNNPolicy(PreTrainedPolicy):
     def _load_as_safetensor(cls: type[T], model: T, model_file: str, map_location: str, strict: bool) -> T:
         """Loads weights and refuses a broken or foreign file: random layers would look like a bad policy."""
         expected = {key: value for key, value in model.state_dict().items() if not key.startswith(MEMORY_PREFIX)}
-        weights = read_weights(model_file, expected, of_any_size=MEMORY_PREFIX)
+        weights = read_weights(model_file, expected, of_any_size=(MEMORY_PREFIX, OLD_MEMORY_PREFIX))
         model.load_state_dict(weights, strict=False)  # `read_weights` has checked all but the memory
         if model.recall is not None and not any(key.startswith(MEMORY_PREFIX) for key in weights):
             logger.warning(
