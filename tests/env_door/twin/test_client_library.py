@@ -266,7 +266,7 @@ def test_it_dies_with_its_parent():
 @pytest.mark.parametrize(
     ("flag", "says"),
     [
-        ("--kind=lift", "one of ['push', 'pull', 'slide', 'random'], got 'lift'"),
+        ("--kind=lift", "'slide_right_ccw', 'random'], got 'lift'"),
         ("--door_offset=1", "at most 0.05 m, got 1.0"),
         ("--address=8.8.8.8", "choose an address of this machine"),
         ("--speed=1", "--speed"),
