@@ -292,23 +292,33 @@ class Recall:
 
     def _select(self, refuted: Tensor, candidates: Tensor, phases: Tensor, sensed: Tensor) -> tuple[int, Prediction]:
         """4. Which of the candidates (N,) to keep, and what they imagine over the horizon, (T, N, ...)."""
-        network, at = self.model.network, phases[candidates]
-        state = network.step(sensed.expand(len(at), -1), self.moments.before.at(at))
+        moments, network, at = self.moments, self.model.network, phases[candidates]
+        # From where each has parted from the others: before, a state does not know which way it will go.
+        same = torch.stack([moments.same_way(int(which), int(phases[which]), math.inf) for which in candidates])
+        known = torch.tensor(
+            [
+                moments.parting(int(which), phases, [int(k) for k in candidates if alike[k] < REFUTED])
+                for which, alike in zip(candidates, same, strict=True)
+            ],
+            device=at.device,
+        )
+        remembered = torch.cat((moments.joints[known], moments.features[known]), dim=-1)
+        state = network.step(remembered, moments.before.at(known))
         horizon = max(1, round(self.config.recall.horizon * self._fps))
         futures = network.predict(self.model.imagine(state, horizon).at(slice(1, None)))
         unsure = uncertainty(futures.log_variance[-1], network.joint_dim, self.config.foresight.variance_aggregation)
         if self.config.exploration != "foresight":
             unsure = torch.zeros_like(unsure)
-        looks = (self.moments.features[at] - self._features(sensed)).norm(dim=-1)
-        strange = looks > self.config.recall.strange * looks.min().clamp(min=self.moments.alike)
+        looks = (moments.features[at] - self._features(sensed)).norm(dim=-1)
+        strange = looks > self.config.recall.strange * looks.min().clamp(min=moments.alike)
         # Weights are rounded: small ones are no reason to prefer a way.
         keys = list(zip(strange.tolist(), (4 * refuted).round().tolist(), unsure.tolist(), strict=True))
         best = min(range(len(keys)), key=keys.__getitem__)
         # Of the demonstrations that go its way, one whose scene is as near as any: objects may have moved.
-        same = self.moments.same_way(int(candidates[best]), int(at[best]), math.inf)[candidates] > REFUTED
-        same &= torch.tensor([key[:2] == keys[best][:2] for key in keys], device=same.device)
-        same &= looks <= looks[same].min() + self.moments.alike
-        return int(unsure.masked_fill(~same, math.inf).argmin()), futures
+        fits = same[best][candidates] > REFUTED
+        fits &= torch.tensor([key[:2] == keys[best][:2] for key in keys], device=fits.device)
+        fits &= looks <= looks[fits].min() + moments.alike
+        return int(unsure.masked_fill(~fits, math.inf).argmin()), futures
 
     def _retrace(self, plan: _Plan, joints: Tensor) -> Tensor | None:
         """5. What to command on the way back; `None` if the arm is there, or gets no nearer."""

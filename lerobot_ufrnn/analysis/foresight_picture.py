@@ -83,7 +83,7 @@ def _representatives(ends: Tensor, chosen: int) -> list[int]:
 def _title(policy: UFRNNPolicy, imagined: Imagination, number: int) -> str:
     kept = " (kept)" if number == imagined.chosen else ""
     if imagined.refuted is not None:
-        return f"future {number + 1}{kept}\nrefuted by {imagined.refuted[number]:.2g}"
+        return f"future {number + 1}{kept}\nrefuted by {imagined.refuted[number]:.1f}"
     aggregation = policy.config.foresight.variance_aggregation
     final = uncertainty(imagined.futures.log_variance[-1, number], policy.model.network.joint_dim, aggregation)
     return f"future {number + 1}{kept}\nuncertainty {final:.3g}"
