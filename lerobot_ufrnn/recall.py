@@ -293,11 +293,11 @@ class Recall:
     def _select(self, refuted: Tensor, candidates: Tensor, phases: Tensor, sensed: Tensor) -> tuple[int, Prediction]:
         """4. Which of the candidates (N,) to keep, and what they imagine over the horizon, (T, N, ...)."""
         moments, network, at = self.moments, self.model.network, phases[candidates]
-        # From where each has parted from the others: before, a state does not know which way it will go.
+        # From where each has parted from all other ways: before, a state does not know which one it will go.
         same = torch.stack([moments.same_way(int(which), int(phases[which]), math.inf) for which in candidates])
         known = torch.tensor(
             [
-                moments.parting(int(which), phases, [int(k) for k in candidates if alike[k] < REFUTED])
+                moments.parting(int(which), phases, (alike < REFUTED).nonzero()[:, 0].tolist())
                 for which, alike in zip(candidates, same, strict=True)
             ],
             device=at.device,
