@@ -205,18 +205,14 @@ class Moments:
         """`int`: number n of demonstrations."""
         return len(self.begin)
 
-    def nearest_of_each(self, distances: Tensor) -> Tensor:
-        """Least distance to each demonstration, from that to each moment: (..., M) -> (..., n)."""
-        return _nearest_of_each(distances, self.owner, self.size)
-
     def pull(self, joints: Tensor, commands: Tensor) -> Tensor:
         """What commands ask for, (..., D_j): from joints to command, no farther than demonstrations usually asked."""
         asked = commands - joints
         return asked * (self.lead / asked.norm(dim=-1, keepdim=True).clamp(min=self.lead))
 
-    def gap(self, joints: Tensor, moments: Tensor | slice = slice(None)) -> Tensor:
-        """Distance of joints (K, D_j) from the path at these moments, (K, moments)."""
-        return (torch.cdist(joints, self.joints[moments]) - self.half_step[moments]).clamp(min=0)
+    def gap(self, joints: Tensor) -> Tensor:
+        """Distance of joints (K, D_j) from the path at each moment, (K, M)."""
+        return (torch.cdist(joints, self.joints) - self.half_step).clamp(min=0)
 
     def same_way(self, which: int, start: int, length: float) -> Tensor:
         """How much each demonstration passes along a piece of one, (n,): from its moment `start` over a length of path.
@@ -258,6 +254,7 @@ class Moments:
 
 
 def _nearest_of_each(distances: Tensor, owner: Tensor, count: int) -> Tensor:
+    """Least distance to each demonstration, from that to each moment: (..., M) -> (..., n)."""
     nearest = distances.new_full((*distances.shape[:-1], count), math.inf)
     return nearest.scatter_reduce(-1, owner.expand_as(distances), distances, "amin")
 

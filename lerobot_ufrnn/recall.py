@@ -249,9 +249,10 @@ class Recall:
         near = trail.near(at)
         if near.sum() < 2:
             return None
-        followed = trail.followed(at)
-        if tried is not None:
-            followed = torch.zeros_like(followed)
+        if tried is None:
+            followed = trail.followed(at)
+        else:
+            followed = torch.zeros_like(trail.away[at])
             followed[tried[0]] = 1.0
         likely = (followed > LIKELY).nonzero()[:, 0].tolist()
         pieces = [self._barred(which, int(trail.phases[-1, which]) if tried is None else tried[1]) for which in likely]
