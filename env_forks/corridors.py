@@ -53,14 +53,19 @@ class Corridors:
 
     def _inside(self, point: np.ndarray, heads: np.ndarray) -> np.ndarray:
         """The point itself, or if it is in a wall, the nearest one of the nearest corridor."""
-        along = heads - self._tails
-        fraction = ((point - self._tails) * along).sum(1) / np.maximum((along**2).sum(1), 1e-9)
-        middles = self._tails + np.clip(fraction, 0, 1)[:, None] * along
+        middles = nearest_on_lines(point, self._tails, heads)
         gaps = np.linalg.norm(point - middles, axis=1)
         nearest = gaps.argmin()
         if gaps[nearest] <= self.task.play:
             return point
         return middles[nearest] + (point - middles[nearest]) * self.task.play / gaps[nearest]
+
+
+def nearest_on_lines(point: np.ndarray, tails: np.ndarray, heads: np.ndarray) -> np.ndarray:
+    """The point `(K, 2)` of each line, from tail to head, that is nearest to a given one."""
+    along = heads - tails
+    fraction = ((point - tails) * along).sum(1) / np.maximum((along**2).sum(1), 1e-9)
+    return tails + np.clip(fraction, 0, 1)[:, None] * along
 
 
 def limited(vector: np.ndarray, length: float) -> np.ndarray:

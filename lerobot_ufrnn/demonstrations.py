@@ -109,7 +109,7 @@ class Moments:
         apart (`Tensor`): how far each moment is from the path of each demonstration, (M, n).
         dwell (`Tensor`): for how many seconds the demonstration stayed near each; infinite where it ended, (M,).
         near (`float`): distance of joints that is near: how far one demonstration usually passes another.
-        alike (`float`): the same of features.
+        alike (`float`): difference of features that is none: twice that to the demonstration that looks most alike.
         pace (`float`): usual distance from moment to moment.
         lead (`float`): usual distance from joints to their command.
         spacing (`float`): seconds from moment to moment.
@@ -173,10 +173,11 @@ class Moments:
             if near <= most:
                 break  # of fewer demonstrations a way, those farther off go another way
         near = max(pace, min(near, most))
-        differences = to_neighbour(looks.masked_fill(gaps >= near, math.inf), rank)
+        # The nearest one only: where a colour tells the way, those of the other ways look different.
+        differences = to_neighbour(looks.masked_fill(gaps >= near, math.inf), 1)
         differences = differences[differences.isfinite()]
         change = float(torch.cat([(part[1:, dim:] - part[:-1, dim:]).norm(dim=-1) for part in parts]).median())
-        alike = max(float(differences.quantile(0.95)) if len(differences) else 0.0, change, 1e-6)
+        alike = max(2 * float(differences.quantile(0.95)) if len(differences) else 0.0, change, 1e-6)
         moments = cls(
             joints=all_joints,
             features=features,

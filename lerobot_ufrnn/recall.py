@@ -54,7 +54,7 @@ LONGEST_LEAD = 4  # moments by which commands may be ahead of an arm that lags, 
 SAME_DIRECTION = 0.8  # cosine from which network and demonstration command the same
 AGREED = 3  # steps for which they must, until the network is in command
 ON_WAY = 2.0  # distance from the demonstration up to which it may be, in units of `near`
-OFF_WAY = 4.0  # distance from which on the arm makes no progress
+OFF_WAY = 4.0  # distance from which on the arm makes no progress, and may not rest as if it were at an end
 FADING = 0.9  # of the offset between arm and demonstration, what is left after a moment
 
 
@@ -215,7 +215,8 @@ class Recall:
             return ""
         if episode.strange * moments.spacing >= STRANGE_SECONDS:
             return "strange"
-        longest = float(moments.dwell[here & (last.looks <= self.config.recall.strange + least)].max())
+        rested = moments.dwell[here & (last.looks <= self.config.recall.strange + least)].max()
+        longest = float(rested) if last.gaps.min() <= OFF_WAY * moments.near else 0.0
         too_long = self.config.recall.stay * longest + GRACE
         if episode.stayed / self._fps > too_long or episode.no_progress * moments.spacing > too_long + NO_PROGRESS:
             return "stayed"

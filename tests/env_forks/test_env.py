@@ -118,6 +118,20 @@ def test_out_and_back_may_turn_a_little_before_the_end(short_by, success):
     assert infos[-1]["is_success"] == terminated == success
 
 
+# A finger of radius 0.035 between walls cuts the corners at the fork, of 60 degrees, by 0.035 * (1 - sin(30 degrees)).
+@pytest.mark.parametrize(("name", "tolerance"), [("slack", 0.0), ("blocks", 0.0175 + 0.003)])
+def test_walls_keep_it_in_the_corridors_however_it_is_pulled(name, tolerance):
+    env = ForksEnv(name)
+    env.reset(seed=0, options={"way": 1})
+    lines = np.concatenate([np.linspace(*env.nodes[[env.task.tree.parents[k], k]], 500) for k in range(1, 5)])
+    rng, target = np.random.default_rng(0), env.nodes[1]
+    for step in range(300):
+        if step % 6 == 0:
+            target = rng.uniform(0, 1, 2)
+        env.step(target)
+        assert np.linalg.norm(lines - env.world.position, axis=1).min() < env.task.play + 0.001 + tolerance
+
+
 def test_the_gate_that_gives_way_later_blocks_at_first():
     env = ForksEnv("gives_way_later")
     targets = plan(env, 1)

@@ -160,11 +160,17 @@ def test_near_is_how_far_demonstrations_pass_each_other_but_no_less_than_pace_an
     assert near(1.0) == pytest.approx(0.05 * math.hypot(12, 3))
 
 
-def test_alike_is_how_much_scenes_differ_from_one_demonstration_to_another_where_they_pass_each_other():
-    scenes = [np.full((31, 1), scene) for scene in (0.0, 0.2, 0.0, 0.2)]
+def test_alike_is_twice_how_much_scenes_differ_from_the_most_alike_demonstration_that_passes():
     ways = [line((0, 0), (3, 0)), line((0, 0), (0, 3))]
-    # Of three others one looks the same, and two differ by 0.2 near the beginning, none far from it.
-    assert moments_of(ways[0], ways[0], ways[1], ways[1], scenes=scenes).alike == pytest.approx(0.2)
+
+    def alike(*values: float) -> float:
+        scenes = [np.full((31, 1), value) for value in values]
+        return moments_of(ways[0], ways[0], ways[1], ways[1], scenes=scenes).alike
+
+    # Far from the beginning the only other one that passes differs by 0.2.
+    assert alike(0.0, 0.2, 0.0, 0.2) == pytest.approx(0.4)
+    # Where a colour tells the way, the other way's is not alike.
+    assert alike(0.0, 0.1, 5.0, 5.1) == pytest.approx(0.2)
     changing = [np.arange(31)[:, None] * 0.3] * 2
     apart = moments_of(ways[0], ways[0] + 5, scenes=changing)
     assert apart.alike == pytest.approx(0.3)  # from one moment to the next

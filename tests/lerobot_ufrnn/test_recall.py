@@ -96,6 +96,16 @@ def test_where_nothing_contradicts_it_never_goes_back(wanted):
     assert searching.run(5).recall.events == [[]]
 
 
+@pytest.mark.parametrize(("beyond", "goes_back"), [(0.1, False), (2.0, True)])
+def test_at_the_end_of_a_demonstration_it_may_rest_but_not_far_beyond(beyond, goes_back):
+    robot = Robot(THREE)
+    searching = search(THREE, (1,), robot).run(2)
+    robot.position, robot.held = robot.paths[(1,)][-1] + np.array((beyond, 0)), True
+    robot.paths = {}  # not arrived: nothing tells it that it is done
+    searching.run(5)
+    assert any(searching.recall.events) == goes_back
+
+
 def test_where_there_is_a_single_way_it_never_goes_back():
     robot = Robot([(0,)], barred=[(0,)])
     searching = search([(0,)], (0,), robot, repeats=4).run(20)
