@@ -41,7 +41,7 @@ class ForksEnv(gym.Env):
     ## Starting State
 
     The same seed gives the same start for every way. `reset(options=...)` takes `way`, the one that goes on, and
-    `demonstration`: whether to set up a demonstration, in which gates give way at once and shifts are smaller.
+    `demonstration`: whether to set up a demonstration, in which gates give way at once.
 
     ## Episode End
 
@@ -105,8 +105,7 @@ class ForksEnv(gym.Env):
             raise ValueError(f"options may hold way and demonstration, got {sorted(options)} too.")
         task = self.task
         # Nothing that is drawn depends on the way, nor on whether the way is.
-        shift = task.shift if demonstration else max(task.shift, task.trial_shift)
-        self.nodes = np.array(task.tree.nodes) + self.np_random.uniform(-shift, shift, 2)
+        self.nodes = np.array(task.tree.nodes) + self.np_random.uniform(-task.shift, task.shift, 2)
         position = self.nodes[0] + self.np_random.uniform(-task.start, task.start, 2) * (1, 0.3)
         drawn = int(self.np_random.integers(len(task.ways)))
         self.current_way = drawn if way is None else self._checked_way(way)

@@ -64,8 +64,7 @@ class Task:
     play: float = 0.02  # how far the disc may be from the middle of a corridor
     speed: float = 0.018  # of a demonstration, for each step
     start: float = 0.02  # half-width of the range in which the disc starts, sideways
-    shift: float = 0.0  # half-width of the range in which everything is shifted in demonstrations
-    trial_shift: float = 0.0  # the same in trials
+    shift: float = 0.0  # half-width of the range in which everything is shifted
     matched: bool = True  # whether the ways share the seeds of their demonstrations
     cue: bool = False  # a colour tells the way, and a wrong try ends the trial
     lamp: bool = False  # no gate is shut; a lamp goes on at the end of the right way
@@ -124,7 +123,7 @@ TASKS = {
         Task("shown", "a colour tells the way: trying is wrong", cue=True),
         Task("no_fork", "a single way: going back is needless", fan(40)),
         Task("gives_way_later", "the right gate is shut for the first 12 s", shut_steps=120),
-        Task("moved", "everything is shifted, further than in demonstrations", shift=0.03, trial_shift=0.045),
+        Task("moved", "everything is shifted, otherwise than in any demonstration", shift=0.03, end_radius=0.05),
         Task("unmatched", "each demonstration starts elsewhere", start=0.03, matched=False),
         Task("noise_and_delay", "noisy position, observations 0.2 s late", noise=0.004, delay=2),
         Task("lamp", "nothing blocks: only a lamp tells", lamp=True),

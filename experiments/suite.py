@@ -190,7 +190,8 @@ def describe(table: pd.DataFrame) -> str:
             for model, group in part.groupby("model")
             if group.task.isin(names).any()
         ]
-        sections.append(f"{updates} updates\n\n{markdown(pd.DataFrame(rows))}")
+        title = f"{updates} updates" if updates else "Demonstrations carried out by replay.py: nothing is trained"
+        sections.append(f"{title}\n\n{markdown(pd.DataFrame(rows))}")
     return "\n".join([*sections, NOTES])
 
 
