@@ -52,7 +52,7 @@ NEVER_ENTERED = 0.75  # weight against a way whose beginning could not be reache
 RUN_UP = 1.0  # distance before the fork from which a way is entered, in units of `near`
 LONGEST_LEAD = 4  # moments by which commands may be ahead of an arm that lags, so that they press on against a load
 SAME_DIRECTION = 0.8  # cosine from which network and demonstration command the same
-AGREED = 3  # steps for which they must, until the network is in command
+AGREED = 0.3  # seconds for which they must, until the network is in command
 ON_WAY = 2.0  # distance from the demonstration up to which it may be, in units of `near`
 OFF_WAY = 4.0  # distance from which on the arm makes no progress, and may not rest as if it were at an end
 FADING = 0.9  # of the offset between arm and demonstration, what is left after a moment
@@ -363,7 +363,7 @@ class Recall:
         agrees = float(asked @ own) > SAME_DIRECTION * float(asked.norm() * own.norm())
         agrees &= off_way <= ON_WAY * moments.near
         plan.agreed = plan.agreed + 1 if agrees and plan.at > plan.parted else 0
-        if plan.agreed >= AGREED:
+        if plan.agreed >= AGREED * self._fps:
             return None, command
         episode.trail.last.command = wanted
         state = self.model.network.step(sensed[None], moments.before.at(slice(plan.at, plan.at + 1)))
