@@ -93,7 +93,7 @@ class Replay:
         return self._actions[self._at]
 
 
-def endless(order: str, kinds: Sequence[str], kind: str, seed: int) -> Iterator[int]:
+def endless(order: str, kinds: Sequence[str], kind: str, seed: Sequence[int]) -> Iterator[int]:
     """Numbers of demonstrations, given the kind of each and that of the trial."""
     random = np.random.default_rng(seed)
     if order == "at random":
@@ -121,15 +121,15 @@ def make_env(task: str, kind: str, log: Path) -> gym.Env:
     return make_task(task=task, way=way, trial_log=str(log), max_episode_steps=EPISODE_STEPS)
 
 
-def try_all(config: ReplayConfig, task: str, root: Path, order: str) -> list[Trial]:
-    """Trials of all kinds or ways."""
-    demonstrations, kinds = read_demonstrations(root)
+def try_all(config: ReplayConfig, task: str, number: int, order: str) -> list[Trial]:
+    """Trials of all kinds or ways with a set of demonstrations."""
+    demonstrations, kinds = read_demonstrations(config.output_dir / task / f"set{number}" / "dataset")
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "trials.jsonl"
         for kind in sorted(set(kinds)):
             with contextlib.closing(make_env(task, kind, log)) as env:
                 for seed in range(FIRST_TRIAL, FIRST_TRIAL + config.trials_per_way):
-                    replay = Replay(demonstrations, endless(order, kinds, kind, seed))
+                    replay = Replay(demonstrations, endless(order, kinds, kind, (number, seed)))
                     observation, _ = env.reset(seed=seed)
                     ended = False
                     while not ended:
@@ -147,7 +147,7 @@ def main(config: ReplayConfig) -> None:
         flags |= {"episodes_per_kind": config.episodes_per_way, "seed": number * SEEDS_OF_A_SET}
         ways = len(KINDS) if task == "door" else len(TASKS[task].ways)
         record_missing(home / "dataset", home, flags, config.episodes_per_way * ways)
-        trials = try_all(config, task, home / "dataset", order)
+        trials = try_all(config, task, number, order)
         wrong = [trial for trial in trials if trial.first_try_wrong]
         print(
             f"{task}, set {number}, {order}: {sum(trial.success for trial in trials)} of {len(trials)}, recovered "

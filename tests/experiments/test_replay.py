@@ -45,13 +45,13 @@ def test_one_that_is_blocked_is_taken_back_after_a_while():
 
 def test_orders_take_each_in_turn_or_any_or_those_of_the_right_kind():
     kinds = ["a", "b", "c", "a"]
-    in_turn = list(itertools.islice(endless("in turn", kinds, "a", 3), 8))
+    in_turn = list(itertools.islice(endless("in turn", kinds, "a", (0, 3)), 8))
     assert sorted(in_turn[:4]) == [0, 1, 2, 3]
     assert in_turn[4:] == in_turn[:4]
-    at_random = list(itertools.islice(endless("at random", kinds, "a", 3), 200))
+    at_random = list(itertools.islice(endless("at random", kinds, "a", (0, 3)), 200))
     assert set(at_random) == {0, 1, 2, 3}
     assert any(one == next_one for one, next_one in itertools.pairwise(at_random))
-    assert set(itertools.islice(endless("known", kinds, "a", 3), 20)) == {0, 3}
+    assert set(itertools.islice(endless("known", kinds, "a", (0, 3)), 20)) == {0, 3}
 
 
 def test_rows_are_added_to_the_table_of_the_suite(tmp_path, monkeypatch, capsys):
