@@ -116,9 +116,10 @@ class OpenGLRenderer:
             self._context.free()
         self._drawing = self._context = None
 
-    def __del__(self) -> None:
-        # Without its context at hand, freeing what was drawn with would crash; at exit the display may be gone already.
-        with contextlib.suppress(Exception):
+    def __del__(self, suppress: type = contextlib.suppress) -> None:
+        # Without its context at hand, freeing what was drawn with would crash; at exit the display may be gone already,
+        # and so may this module's names.
+        with suppress(Exception):
             self.close()
 
 
