@@ -127,7 +127,7 @@ TASKS = {
         Task("unmatched", "each demonstration starts elsewhere", start=0.03, matched=False),
         Task("noise_and_delay", "noisy position, observations 0.2 s late", noise=0.004, delay=2),
         Task("lamp", "nothing blocks: only a lamp tells", lamp=True),
-        Task("blocks", "one of three blocks slides: contact in MuJoCo", contact=True),
+        Task("blocks", "one of three blocks slides between walls: contact in MuJoCo", contact=True),
     )
 }
 """All tasks by their names."""
