@@ -39,10 +39,7 @@ REGISTERS = [
 RobotMode = IntEnum("RobotMode", {"BOOTING": 2, "POWER_OFF": 3, "IDLE": 5, "RUNNING": 7})
 SafetyMode = IntEnum(
     "SafetyMode",
-    {
-        **{"NORMAL": 1, "PROTECTIVE_STOP": 3, "RECOVERY": 4, "SAFEGUARD_STOP": 5},
-        **{"ROBOT_EMERGENCY_STOP": 7, "VIOLATION": 8},
-    },
+    {"NORMAL": 1, "PROTECTIVE_STOP": 3, "RECOVERY": 4, "SAFEGUARD_STOP": 5, "ROBOT_EMERGENCY_STOP": 7, "VIOLATION": 8},
 )
 ProgramState = IntEnum("ProgramState", {"STOPPED": 1, "PLAYING": 2, "PAUSED": 4})
 

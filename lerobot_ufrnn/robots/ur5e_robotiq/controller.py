@@ -1,12 +1,12 @@
 """What is asked of the controller before the arm is commanded, and how its program is ended when nobody commands it."""
 
 import contextlib
+import io
 import logging
 import socket
 import struct
 import time
 from collections.abc import Iterator
-from typing import BinaryIO
 
 from .configuration import UR5eRobotiqConfig
 from .faults import Fault, RobotFaultError, safety_fault
@@ -90,7 +90,7 @@ def check_version(ip: str) -> None:
         raise RobotFaultError(Fault.CONTROLLER_VERSION, wanted)
 
 
-def _exchange(stream: BinaryIO, kind: str, body: bytes = b"") -> bytes:
+def _exchange(stream: io.BufferedRWPair, kind: str, body: bytes = b"") -> bytes:
     """Answer to a package of RTDE, of the same kind; raises an `OSError` if there is none."""
     stream.write(RTDE_HEADER.pack(RTDE_HEADER.size + len(body), ord(kind)) + body)
     stream.flush()

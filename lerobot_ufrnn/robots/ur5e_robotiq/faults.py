@@ -29,10 +29,7 @@ class Fault(IntEnum):
     PROGRAM_RUNNING = 18, "end it on the pendant, or let it be ended by --robot.stop_running_program=true"
     REGISTERS_IN_USE = (
         19,
-        (
-            "end the other program that commands the arm, or disable EtherNet/IP, PROFINET and MODBUS in the installation, "
-            "then connect again"
-        ),
+        "end what else commands the arm, disable EtherNet/IP, PROFINET and MODBUS, then connect again",
     )
     GRIPPER_NOT_ACTIVE = 20, "clear the gripper, then connect again: it is activated, and opens and closes once"
     CONTROLLER_VERSION = 21, "update the controller, or use another one"
