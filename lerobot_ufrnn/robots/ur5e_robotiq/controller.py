@@ -47,10 +47,9 @@ def open_dashboard(ip: str) -> Iterator[Dashboard]:
 
 
 def check_ready(config: UR5eRobotiqConfig) -> None:
-    """Raises a `RobotFaultError` unless the controller can be commanded and no other program runs on it.
+    """Raises a `RobotFaultError` unless the controller can be commanded and no other program is under way on it.
 
-    Its answers say more than a client that cannot start its program, and they come in time or not at all: the client's
-    constructors would wait for ever.
+    Its answers say more than a client that cannot start its program, whose constructors would also wait for ever.
     """
     check_version(config.ip)
     try:
@@ -61,7 +60,7 @@ def check_ready(config: UR5eRobotiqConfig) -> None:
     except OSError as error:
         silence = f"no controller answers at {config.ip}, port {DASHBOARD_PORT}: {error}"
         raise RobotFaultError(Fault.LINK_LOST, silence) from error
-    if (stopped := safety_fault(safety.rpartition(":")[2].strip())) is not None:
+    if (stopped := safety_fault(safety.rpartition(":")[2].strip().upper())) is not None:
         raise stopped
     if "RUNNING" not in mode:
         raise RobotFaultError(Fault.NOT_RUNNING, f"the robot mode is '{mode}'")

@@ -1,6 +1,7 @@
 """Robotiq 2F-85 through the socket that its URCap opens on the controller."""
 
 import contextlib
+import itertools
 import logging
 import re
 import socket
@@ -77,7 +78,7 @@ class RobotiqGripper:
         config = self._config
         with self._telling_silence():
             self._socket.connect((config.ip, config.gripper_port))
-            if self._check_fault() or self._get("STA") != ACTIVE:
+            if any(self._waits_for_activation(by) for by in ("FLT", "STA")):
                 self._activate()
             self._set(GTO=1, SPE=round(FULL * config.gripper_speed), FOR=round(FULL * config.gripper_force))
             self._measure()
@@ -109,6 +110,7 @@ class RobotiqGripper:
 
     def _follow(self) -> None:
         sent = None
+        signs = itertools.cycle(("FLT", "STA"))  # one at a time, so that positions come more often
         try:
             with self._telling_silence():
                 while not self._stop.wait(POLL_SECONDS):
@@ -116,10 +118,9 @@ class RobotiqGripper:
                         self._set(POS=target)
                         sent = target
                     self._measure()
-                    waiting, status = self._check_fault(), self._get("STA")
-                    if waiting or status != ACTIVE:
-                        lost = f"the gripper has lost its activation (status {status}, fault {waiting})"
-                        raise RobotFaultError(Fault.GRIPPER_NOT_ACTIVE, f"{lost}, as after an emergency stop")
+                    if self._waits_for_activation(by=next(signs)):
+                        lost = "the gripper has lost its activation, as after an emergency stop"
+                        raise RobotFaultError(Fault.GRIPPER_NOT_ACTIVE, lost)
         except RobotFaultError as fault:
             self._fault = fault
 
@@ -148,11 +149,14 @@ class RobotiqGripper:
         asked = time.monotonic()
         self._position, self._asked = self._get("POS"), asked
 
-    def _check_fault(self) -> int:
-        """0, or the code of a fault that only waits for activation; raises a `RobotFaultError` on any other."""
-        if (fault := self._get("FLT")) >= FIRST_FAULT:
-            raise RobotFaultError(Fault.GRIPPER_FAULT, f"the gripper reports fault {fault}")
-        return fault
+    def _waits_for_activation(self, by: str) -> bool:
+        """Whether its fault (FLT) or its status (STA) says so; raises a `RobotFaultError` on any other fault."""
+        value = self._get(by)
+        if by == "STA":
+            return value != ACTIVE
+        if value >= FIRST_FAULT:
+            raise RobotFaultError(Fault.GRIPPER_FAULT, f"the gripper reports fault {value}")
+        return value > 0
 
     def _get(self, name: str) -> int:
         return int(ask(self._socket, f"GET {name}", rf"{name}\s+(\d+)"))

@@ -26,7 +26,7 @@ STOP_DECELERATION = 4.0  # in rad/s^2, with which the arm is stopped
 SETTLE_SECONDS = 0.1  # that the values that tell of one cause may take to come in
 SILENT_SECONDS = 0.5  # beyond `stale_after` that the servo process may be silent; it tells of faults within that time
 STOP_SECONDS = 3.0  # that it may take to end by itself; by then the controller's watchdog has stopped the arm
-HOPELESS_SECONDS = 0.5  # the same where it cannot stop the arm any more
+HOPELESS_SECONDS = 0.5  # the same where it hardly can, or does not command the arm yet
 HOPELESS = (Fault.LINK_LOST, Fault.STALE_DATA, Fault.SERVO_LATE)
 
 ROBOT_MODE_RUNNING = 7  # as the controller numbers its modes
@@ -123,7 +123,8 @@ class Servo:
             return
         cause = self.fault
         self._shared.stop.value = True
-        self._process.join(HOPELESS_SECONDS if cause and cause.fault in HOPELESS else STOP_SECONDS)
+        hopeless = not self._shared.ready.value or (cause is not None and cause.fault in HOPELESS)
+        self._process.join(HOPELESS_SECONDS if hopeless else STOP_SECONDS)
         if self._process.is_alive():
             self._process.kill()
             self._process.join(timeout=1.0)
