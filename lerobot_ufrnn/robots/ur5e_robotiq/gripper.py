@@ -17,6 +17,7 @@ logger = logging.getLogger(__name__)
 TIMEOUT = 1.0  # s that the gripper may take to answer
 MORE_SECONDS = 0.01  # after which no more digits of a number come
 MAX_AGE = 1.0  # s from which a position is no measured one any more
+MAX_WAIT = 0.3  # s for which a new one is waited for then
 ACTIVATION_SECONDS = 15.0  # that activating may take: it opens and closes once
 POLL_SECONDS = 0.05  # between two questions; the socket takes tens of milliseconds for each anyway
 ACTIVE = 3  # its status once it is activated
@@ -95,10 +96,14 @@ class RobotiqGripper:
     @property
     def closure(self) -> float:
         """`float`: measured, from 0, open, to 1, closed; raises a `RobotFaultError` on a silent or faulty gripper."""
+        # A program that was held up, its threads and all, asks for a new position at once when it goes on.
+        deadline = time.monotonic() + MAX_WAIT
+        while self._fault is None and (age := time.monotonic() - self._asked) > MAX_AGE:
+            if time.monotonic() > deadline:
+                raise RobotFaultError(Fault.GRIPPER_SILENT, f"the gripper's position is {age:.1f} s old")
+            time.sleep(0.005)
         if self._fault is not None:
             raise self._fault
-        if (age := time.monotonic() - self._asked) > MAX_AGE:
-            raise RobotFaultError(Fault.GRIPPER_SILENT, f"the gripper's position is {age:.1f} s old")
         return closure_at(self._position, self._config.gripper_range)
 
     def move_to(self, closure: float) -> None:

@@ -116,6 +116,15 @@ def test_a_position_that_is_too_old_is_not_passed_off_as_measured(connect, monke
     assert told.value.fault is Fault.GRIPPER_SILENT
 
 
+def test_a_position_that_grew_old_while_the_program_was_held_up_is_replaced(connect):
+    server = FakeGripper()
+    gripper = connect(server)
+    server.values["POS"] = 230
+    gripper._asked -= 10.0
+    gripper._position = 3
+    assert gripper.closure == 1.0
+
+
 class Pieces:
     """A connection on which an answer comes in so many pieces."""
 
