@@ -6,6 +6,7 @@ recording; the script fails if something did that must not be. Real time: leave 
 """
 
 import contextlib
+import re
 import signal
 import tempfile
 import time
@@ -36,6 +37,7 @@ MAX_STOP_SECONDS = 3.0  # longest time until the standstill; a silent gripper ta
 HANG_SECONDS = 60.0  # time from which a command that still runs counts as hung
 WATCH_SECONDS = 1.0  # how long one looks on after the end of the command, and once more after all is in order again
 SAMPLE_SECONDS = 0.004
+WARNINGS = ("The controller scales", "See on the pendant")  # of the robot, which go on without an error
 
 
 # ── What is made to fail ──────────────────────────────────────────────
@@ -74,8 +76,10 @@ def servo(command: StockCommand) -> psutil.Process:
 
 
 TWIN_FAILURES = (
-    *("drop_link", "freeze", "protective_stop", "emergency_stop", "power_off", "script_stop"),
-    *("gripper_silent", "gripper_garbage", "gripper_gone", "gripper_fault"),
+    *("drop_link", "close_link", "close_control", "freeze"),
+    *("protective_stop", "safeguard_stop", "recovery_mode", "safety_violation", "emergency_stop"),
+    *("power_off", "script_stop"),
+    *("gripper_silent", "gripper_garbage", "gripper_gone", "gripper_fault", "gripper_reset"),
     *("camera_gone", "camera_freeze", "camera_black"),
 )
 INJECTIONS = {
@@ -83,6 +87,9 @@ INJECTIONS = {
     "delay": Injection(on_twin("delay", ms=500.0)),
     "dashboard_gone": Injection(on_twin("dashboard_gone"), must_stop=False),
     "remote_control_off": Injection(on_twin("remote_control_off"), must_stop=False),
+    "speed_slider": Injection(on_twin("speed_slider", fraction=0.2), must_stop=False),
+    "gripper_not_active": Injection(on_twin("gripper_fault", code=5)),
+    "servo_terminated": Injection(lambda twin, command: servo(command).terminate()),
     "servo_killed": Injection(lambda twin, command: servo(command).kill()),
     "servo_paused": Injection(lambda twin, command: servo(command).suspend()),
     "command_paused": Injection(send(signal.SIGSTOP), release=send(signal.SIGCONT)),
@@ -135,7 +142,7 @@ class Outcome:
     status: int | None  # exit status, negative if a signal ended it
     message: str  # what the user saw; empty if nothing
     still_when_cleared: bool  # whether the arm stayed where it was when the injection was cleared
-    left_running: tuple[str, ...]  # processes of the command that were still there after its end
+    left_running: tuple[str, ...]  # processes of the command that were still there after its end, and a program
     episodes: tuple[int, ...]  # frames of each recorded episode that can be read; one was recorded before
 
     @property
@@ -168,7 +175,9 @@ class Outcome:
             return "**FAILED**: " + ", ".join(problems)
         if self.status != 0:
             return "stopped; the recording cannot be read" if self.lost else "stopped"
-        return "stopped, then went on" if INJECTIONS[self.name].must_stop else "went on, not noticed"
+        if INJECTIONS[self.name].must_stop:
+            return "stopped, then went on"
+        return "went on" if self.message else "went on, not noticed"
 
     def row(self) -> dict[str, str]:
         """Its row of the table."""
@@ -306,6 +315,8 @@ def watch(name: str, twin: TwinProcess, command: StockCommand, samples: list[Sam
         status = command.poll()
         command.stop()
         left_running = names_of_running(children)
+        if twin.state()["program"] != "STOPPED":
+            left_running += ("a program on the controller",)
     finally:
         for child in children:
             if child.is_running():
@@ -320,11 +331,17 @@ def watch(name: str, twin: TwinProcess, command: StockCommand, samples: list[Sam
         *stop_after(samples, begin),
         ended=ended,
         status=status,
-        message=last_error(command.output()),
+        message=last_error(command.output()) or last_warning(command.output()),
         still_when_cleared=stop_after(cleared, cleared[0].time)[:2] == (0.0, False),
         left_running=left_running,
         episodes=readable_episodes(dataset),
     )
+
+
+def last_warning(output: str) -> str:
+    """The last of the warnings with which the robot goes on; empty if there was none."""
+    found = re.findall(rf"(?:{'|'.join(WARNINGS)}).*", output)
+    return found[-1].strip() if found else ""
 
 
 def names_of_running(children: Sequence[psutil.Process]) -> tuple[str, ...]:

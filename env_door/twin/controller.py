@@ -37,7 +37,10 @@ REGISTERS = [
 
 # What the arm is ready for, why it may not move, and RTDE's `runtime_state`.
 RobotMode = IntEnum("RobotMode", {"BOOTING": 2, "POWER_OFF": 3, "IDLE": 5, "RUNNING": 7})
-SafetyMode = IntEnum("SafetyMode", {"NORMAL": 1, "PROTECTIVE_STOP": 3, "ROBOT_EMERGENCY_STOP": 7})
+SafetyMode = IntEnum(
+    "SafetyMode",
+    {"NORMAL": 1, "PROTECTIVE_STOP": 3, "RECOVERY": 4, "SAFEGUARD_STOP": 5, "ROBOT_EMERGENCY_STOP": 7, "VIOLATION": 8},
+)
 ProgramState = IntEnum("ProgramState", {"STOPPED": 1, "PLAYING": 2, "PAUSED": 4})
 
 
@@ -63,6 +66,7 @@ class Controller:
         self.safety_mode = SafetyMode.NORMAL
         self.program_state = ProgramState.STOPPED
         self.remote_control = True
+        self.speed_fraction = 1.0  # the speed slider; it is told only, and slows nothing down
         self.watchdog: tuple[str, float] | None = None  # an input, and the longest time between two writes of it
         self._written: dict[str, float] = {}  # when
         self._unlock_seconds = unlock_seconds
@@ -142,13 +146,22 @@ class Controller:
 
     def protective_stop(self, reason: str) -> None:
         """Stops at once, pauses the program and waits to be unlocked."""
+        self.safety_stop(SafetyMode.PROTECTIVE_STOP, reason)
+
+    def safety_stop(self, mode: SafetyMode, reason: str) -> None:
+        """Stops at once and pauses the program, in a safety mode that keeps the power on."""
         if self.may_move:
-            logger.warning("protective stop: %s", reason)
+            logger.warning("%s: %s", mode.name, reason)
             if self.program_state == ProgramState.STOPPED:
                 self._program = None  # it was about to start
             self.pause()
-            self.safety_mode, self._stopped_at = SafetyMode.PROTECTIVE_STOP, self.time
+            self.safety_mode, self._stopped_at = mode, self.time
             self.settle()
+
+    def end_safety_stop(self, mode: SafetyMode) -> None:
+        """Ends a stop of a kind that does not wait to be unlocked; the program stays paused."""
+        if self.safety_mode == mode:
+            self.safety_mode = SafetyMode.NORMAL
 
     def unlock(self) -> bool:
         """Ends a protective stop; whether it could be ended: not before the waiting time is over."""

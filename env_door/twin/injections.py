@@ -9,6 +9,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from env_door.twin import camera, ports
+from env_door.twin.controller import SafetyMode
 
 if TYPE_CHECKING:
     from env_door.twin.server import Twin
@@ -57,6 +58,16 @@ def _camera_mode(mode: int) -> Injection:
     return Injection(start, clear)
 
 
+def _hang_up(only_commanding: bool) -> Injection:
+    return Injection(lambda twin: twin.rtde.hang_up(only_commanding), "the client connects again")
+
+
+def _safety_stop(mode: SafetyMode) -> Injection:
+    return Injection(
+        lambda twin: twin.controller.safety_stop(mode, "injected"), lambda twin: twin.controller.end_safety_stop(mode)
+    )
+
+
 def _delay(twin: "Twin", ms: float) -> None:
     if not 0 < ms <= MAX_DELAY:
         raise ValueError(f"injection 'delay': ms={ms} must be above 0 and at most {MAX_DELAY:g} ms")
@@ -69,15 +80,29 @@ def _fail_gripper(twin: "Twin", code: int = OVERCURRENT) -> None:
     twin.controller.gripper.fail(code)
 
 
+def _reset_gripper(twin: "Twin") -> None:
+    twin.controller.gripper.set({"ACT": 0})
+
+
+def _speed_slider(twin: "Twin", fraction: float = 0.2) -> None:
+    if not 0 <= fraction <= 1:
+        raise ValueError(f"injection 'speed_slider': fraction={fraction} must be 0 to 1")
+    twin.controller.speed_fraction = fraction
+
+
 INJECTIONS = {
     "drop_link": _port_gone(ports.RTDE),
+    "close_link": _hang_up(only_commanding=False),
+    "close_control": _hang_up(only_commanding=True),
     "dashboard_gone": _port_gone(ports.DASHBOARD),
     "gripper_gone": _port_gone(ports.GRIPPER),
     "freeze": _flag("rtde.frozen", True),
     "delay": Injection(_delay, lambda twin: setattr(twin.rtde, "delay", 0.0)),
     "remote_control_off": _flag("controller.remote_control", False),
+    "speed_slider": Injection(_speed_slider, lambda twin: setattr(twin.controller, "speed_fraction", 1.0)),
     "gripper_silent": _flag("controller.gripper.silent", True),
     "gripper_garbage": _flag("controller.gripper.garbage", True),
+    "gripper_reset": Injection(_reset_gripper, "the client activates it again"),
     "gripper_fault": Injection(_fail_gripper, lambda twin: twin.controller.gripper.fail(0)),
     "camera_freeze": _camera_mode(camera.FROZEN),
     "camera_black": _camera_mode(camera.BLACK),
@@ -90,5 +115,8 @@ INJECTIONS = {
         lambda twin: twin.controller.protective_stop("injected"),
         "'unlock protective stop' on the dashboard; then the client uploads its script again",
     ),
+    "safeguard_stop": _safety_stop(SafetyMode.SAFEGUARD_STOP),
+    "recovery_mode": _safety_stop(SafetyMode.RECOVERY),
+    "safety_violation": _safety_stop(SafetyMode.VIOLATION),
     "script_stop": Injection(lambda twin: twin.controller.stop_program(), "the client uploads its script again"),
 }

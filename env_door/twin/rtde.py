@@ -60,7 +60,10 @@ JOINT_MODES = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255, RobotMode.BOOTING: 2
 SAFETY_BITS = {
     SafetyMode.NORMAL: 1 << 0,
     SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    SafetyMode.RECOVERY: 1 << 3,
+    SafetyMode.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
     SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
+    SafetyMode.VIOLATION: 1 << 8 | 1 << 10,
 }
 
 Reading = Callable[[], tuple[float, ...]]
@@ -95,6 +98,11 @@ class RTDEServer:
             self.sessions.discard(session)
             self.owners = {name: owner for name, owner in self.owners.items() if owner is not session}
 
+    def hang_up(self, only_commanding: bool) -> None:
+        """Ends the connections of all clients in order, or of those that write inputs; they may connect again."""
+        for session in set(self.owners.values()) if only_commanding else set(self.sessions):
+            session.close()
+
     def take_arrivals(self) -> list[float]:
         """The times at which inputs came, since this was asked last."""
         times = list(self.arrivals)
@@ -124,8 +132,8 @@ class RTDEServer:
             "joint_mode": lambda: (JOINT_MODES[controller.robot_mode],) * 6,
             "safety_mode": lambda: (controller.safety_mode,),
             "safety_status": lambda: (controller.safety_mode,),
-            "speed_scaling": lambda: (float(controller.may_move),),
-            "target_speed_fraction": lambda: (1.0,),
+            "speed_scaling": lambda: (controller.speed_fraction * controller.may_move,),
+            "target_speed_fraction": lambda: (controller.speed_fraction,),
             "runtime_state": lambda: (controller.program_state,),
             "robot_status_bits": lambda: (
                 (controller.robot_mode in POWERED) | (controller.program_state == ProgramState.PLAYING) << 1,
@@ -146,6 +154,10 @@ class RTDESession:
         self._started = False
         self._ticks = 0
         self._due: deque[tuple[float, bytes]] = deque()
+
+    def close(self) -> None:
+        """Hangs up in order."""
+        self._writer.close()
 
     def publish(self) -> None:
         """Sends the measurements if it is time for them; called every 2 ms."""

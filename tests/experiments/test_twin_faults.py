@@ -86,8 +86,9 @@ UNNOTICED = replace(STOPPED, name="dashboard_gone", status=0, message="", episod
         ("drop_link", {"episodes": (0,)}, "**FAILED**: recorded episode lost"),
         # What may be.
         ("drop_link", {}, "stopped"),
-        ("dashboard_gone", {"status": 0, "standstill": None}, "went on, not noticed"),
+        ("dashboard_gone", {"status": 0, "standstill": None, "message": ""}, "went on, not noticed"),
         ("dashboard_gone", {"status": 1}, "stopped"),
+        ("speed_slider", {"status": 0, "message": "The controller scales"}, "went on"),
         ("command_interrupted", {"status": -signal.SIGINT}, "stopped"),
         ("command_killed", {"status": -signal.SIGKILL, "episodes": ()}, "stopped; the recording cannot be read"),
         ("command_paused", {"status": 0, "moved_again": True, "episodes": (60, 40)}, "stopped, then went on"),
@@ -164,7 +165,15 @@ def test_what_must_not_be_fails_the_script_after_the_table(monkeypatch, tmp_path
     assert [line.split(" | ")[0] for line in output.read_text().splitlines()[2:]] == ["| drop_link", "| delay"]
 
 
+def test_a_warning_of_the_robot_is_seen_where_there_is_no_error():
+    output = "WARNING 12:00 robot.py:1 The controller scales the arm's speed to 20 %: slow.\nINFO 12:01 x.py:2 Done\n"
+    assert twin_faults.last_warning(output) == "The controller scales the arm's speed to 20 %: slow."
+    assert twin_faults.last_warning("WARNING 12:00 other.py:1 The camera is late") == ""
+
+
 SEEN = {
+    "close_control": "RobotFaultError: The arm was stopped (link_lost)",
+    "servo_terminated": "RobotFaultError: The arm was stopped (servo_died): somebody told",
     "emergency_stop": "RobotFaultError: The arm was stopped (emergency_stop)",  # and not: the gripper without power
     "servo_paused": "RobotFaultError: The arm was stopped (servo_late): the servo process hangs",
     "command_terminated": "Ending, as asked for by SIGTERM",

@@ -89,7 +89,7 @@ class FakeGripper:
             return f"{words[0]} {self.values[words[0]]}".encode()
         self.values |= zip(words[::2], map(int, words[1::2]), strict=True)
         if self.values["ACT"] == 1 and "ACT" in words:
-            self.values["STA"] = 3
+            self.values |= {"STA": 3, "FLT": self.values["FLT"] if self.values["FLT"] >= 8 else 0}
         return b"ack"
 
     def close(self):

@@ -36,6 +36,8 @@ class UR5eRobotiqConfig(RobotConfig):
 
     ip: str
     """Address of the controller."""
+    stop_running_program: bool = False
+    """Whether to end a program that the controller runs already; otherwise connecting is refused then."""
 
     # Cameras.
     cameras: dict[str, CameraConfig] = field(default_factory=dict)

@@ -1,6 +1,7 @@
 """Robotiq 2F-85 through the socket that its URCap opens on the controller."""
 
 import contextlib
+import itertools
 import logging
 import re
 import socket
@@ -14,11 +15,14 @@ from .faults import Fault, RobotFaultError
 logger = logging.getLogger(__name__)
 
 TIMEOUT = 1.0  # s that the gripper may take to answer
+MORE_SECONDS = 0.01  # after which no more digits of a number come
+MAX_AGE = 1.0  # s from which a position is no measured one any more
+MAX_WAIT = 0.3  # s for which a new one is waited for then
 ACTIVATION_SECONDS = 15.0  # that activating may take: it opens and closes once
 POLL_SECONDS = 0.05  # between two questions; the socket takes tens of milliseconds for each anyway
 ACTIVE = 3  # its status once it is activated
 FULL = 255  # full speed and full force
-FIRST_FAULT = 8  # fault codes below this one only say that a move waits for activation
+FIRST_FAULT = 8  # fault codes below this one, but for 0, only say that a move waits for activation
 
 
 def closure_at(reading: int, gripper_range: tuple[int, int]) -> float:
@@ -30,9 +34,23 @@ def closure_at(reading: int, gripper_range: tuple[int, int]) -> float:
 def ask(connection: socket.socket, command: str, expected: str) -> str:
     """What the group of a pattern finds in the answer to a command; raises an `OSError` without such an answer."""
     connection.sendall(f"{command}\n".encode())
-    # A real URCap answers without a line end, so an answer is what comes in one piece.
-    answer = connection.recv(1024).decode(errors="replace").strip()
-    if (match := re.fullmatch(expected, answer)) is None:
+    answer, patience = "", connection.gettimeout()
+    # It may come in pieces, and a real URCap ends it with no line end: then its number ends when no more digits come.
+    while not answer.endswith("\n"):
+        matches = re.fullmatch(expected, answer)
+        connection.settimeout(MORE_SECONDS if matches else patience)
+        try:
+            piece = connection.recv(1024)
+        except TimeoutError:
+            if not answer:
+                raise
+            break
+        finally:
+            connection.settimeout(patience)
+        if not piece:
+            break
+        answer = (answer + piece.decode(errors="replace")).lstrip()
+    if (match := re.fullmatch(expected, answer.strip())) is None:
         raise ConnectionError(f"it answered {answer!r} to {command}" if answer else "it closed the connection")
     return match[1]
 
@@ -50,7 +68,7 @@ class RobotiqGripper:
         self._thread = threading.Thread(target=self._follow, name="gripper", daemon=True)
         self._stop = threading.Event()
         self._target: int | None = None
-        self._position = config.gripper_range[0]
+        self._position, self._asked = config.gripper_range[0], 0.0  # and when it was asked for
         self._fault: RobotFaultError | None = None
 
     def connect(self) -> None:
@@ -61,11 +79,10 @@ class RobotiqGripper:
         config = self._config
         with self._telling_silence():
             self._socket.connect((config.ip, config.gripper_port))
-            self._check_fault()
-            if self._get("STA") != ACTIVE:
+            if any(self._waits_for_activation(by) for by in ("FLT", "STA")):
                 self._activate()
             self._set(GTO=1, SPE=round(FULL * config.gripper_speed), FOR=round(FULL * config.gripper_force))
-            self._position = self._get("POS")
+            self._measure()
         self._thread.start()
 
     def disconnect(self) -> None:
@@ -79,6 +96,12 @@ class RobotiqGripper:
     @property
     def closure(self) -> float:
         """`float`: measured, from 0, open, to 1, closed; raises a `RobotFaultError` on a silent or faulty gripper."""
+        # A program that was held up, its threads and all, asks for a new position at once when it goes on.
+        deadline = time.monotonic() + MAX_WAIT
+        while self._fault is None and (age := time.monotonic() - self._asked) > MAX_AGE:
+            if time.monotonic() > deadline:
+                raise RobotFaultError(Fault.GRIPPER_SILENT, f"the gripper's position is {age:.1f} s old")
+            time.sleep(0.005)
         if self._fault is not None:
             raise self._fault
         return closure_at(self._position, self._config.gripper_range)
@@ -92,14 +115,17 @@ class RobotiqGripper:
 
     def _follow(self) -> None:
         sent = None
+        signs = itertools.cycle(("FLT", "STA"))  # one at a time, so that positions come more often
         try:
             with self._telling_silence():
                 while not self._stop.wait(POLL_SECONDS):
                     if (target := self._target) != sent and target is not None:
                         self._set(POS=target)
                         sent = target
-                    self._position = self._get("POS")
-                    self._check_fault()
+                    self._measure()
+                    if self._waits_for_activation(by=next(signs)):
+                        lost = "the gripper has lost its activation, as after an emergency stop"
+                        raise RobotFaultError(Fault.GRIPPER_NOT_ACTIVE, lost)
         except RobotFaultError as fault:
             self._fault = fault
 
@@ -124,9 +150,18 @@ class RobotiqGripper:
                 raise RobotFaultError(Fault.GRIPPER_FAULT, f"not active {ACTIVATION_SECONDS:.0f} s after activation")
             time.sleep(POLL_SECONDS)
 
-    def _check_fault(self) -> None:
-        if (fault := self._get("FLT")) >= FIRST_FAULT:
-            raise RobotFaultError(Fault.GRIPPER_FAULT, f"the gripper reports fault {fault}")
+    def _measure(self) -> None:
+        asked = time.monotonic()
+        self._position, self._asked = self._get("POS"), asked
+
+    def _waits_for_activation(self, by: str) -> bool:
+        """Whether its fault (FLT) or its status (STA) says so; raises a `RobotFaultError` on any other fault."""
+        value = self._get(by)
+        if by == "STA":
+            return value != ACTIVE
+        if value >= FIRST_FAULT:
+            raise RobotFaultError(Fault.GRIPPER_FAULT, f"the gripper reports fault {value}")
+        return value > 0
 
     def _get(self, name: str) -> int:
         return int(ask(self._socket, f"GET {name}", rf"{name}\s+(\d+)"))

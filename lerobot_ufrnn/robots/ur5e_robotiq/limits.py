@@ -1,6 +1,7 @@
 """What may be sent to the arm: every target passes through here first."""
 
 from math import isfinite
+from typing import SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ class Limits:
     """Turns what is asked for into what may be sent.
 
     A target is limited, in this order, to the joint ranges, to the joint speed, to a distance from the measured joints
-    and to the workspace. What is no target at all (a wrong number of values, a value that is not finite) is refused.
+    and to the workspace. What is no target at all (a wrong number of values, one that is no finite number) is refused.
     """
 
     def __init__(self, config: UR5eRobotiqConfig):
@@ -49,6 +50,9 @@ class Limits:
                 f"An action must have exactly {list(FEATURES)}, got {sorted(action)}; "
                 "nothing was sent, the arm holds its pose."
             )
+        # `float` would read a text, too.
+        if texts := {name: value for name, value in action.items() if not isinstance(value, SupportsFloat)}:
+            raise ValueError(f"An action must be numbers, got {texts}; nothing was sent, the arm holds its pose.")
         values = {name: float(action[name]) for name in FEATURES}
         if wrong := {name: value for name, value in values.items() if not isfinite(value)}:
             raise ValueError(f"An action must be finite, got {wrong}; nothing was sent, the arm holds its pose.")

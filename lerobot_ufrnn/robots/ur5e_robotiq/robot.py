@@ -19,6 +19,7 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 from numpy.typing import NDArray
 
 from .configuration import FEATURES, UR5eRobotiqConfig
+from .controller import check_ready
 from .faults import Fault, RobotFaultError
 from .gripper import RobotiqGripper
 from .limits import Limits
@@ -29,6 +30,7 @@ logger = logging.getLogger(__name__)
 MAX_IMAGE_AGE_MS = 500  # from which an image shows something else than the measured joints
 DARK = 4.0  # mean of an image, of 255, below which it shows nothing
 WRONG_SECONDS = 1.0  # for which an image must be wrong; a camera may lose a frame or adjust itself
+SPEED_CHANGE = 0.05  # of the controller's speed scaling that is worth a word
 MOVED = 0.05  # rad, of any joint, that cannot leave an image of the arm the same to the last bit
 
 
@@ -54,6 +56,7 @@ class UR5eRobotiq(Robot):
         self._opened = contextlib.ExitStack()
         self._fault: RobotFaultError | None = None
         self._warned = False
+        self._speed_scaling = 1.0
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
@@ -89,11 +92,12 @@ class UR5eRobotiq(Robot):
 
         Raises a `RobotFaultError` if one of them is not ready; nothing stays connected.
         """
-        self._fault = None
+        self._fault, self._speed_scaling = None, 1.0
         self._pictures = {name: PictureCheck(name) for name in self.cameras}
         try:
             self._opened.enter_context(ending_in_order())
-            self._check_ready()
+            import_client()
+            check_ready(self.config)
             for name, camera in self.cameras.items():
                 self._opened.callback(_close, camera)
                 try:
@@ -107,32 +111,11 @@ class UR5eRobotiq(Robot):
             self._servo = Servo(self.config)
             self._opened.callback(self._servo.stop)
             self._servo.start()
+            self._tell_speed(self._servo.speed_scaling)
         except BaseException:
             self._release()
             raise
         logger.info("%s connected to %s.", self, self.config.ip)
-
-    def _check_ready(self) -> None:
-        """Asks the controller's dashboard, whose answers say more than a client that cannot start its program."""
-        _, _, dashboard_client = import_client()
-        dashboard = dashboard_client.DashboardClient(self.config.ip)
-        try:
-            dashboard.connect()
-            safety, mode = dashboard.safetystatus(), dashboard.robotmode()
-            is_remote = dashboard.isInRemoteControl()
-        except RuntimeError as error:
-            silence = f"no controller answers at {self.config.ip}, port 29999: {error}"
-            raise RobotFaultError(Fault.LINK_LOST, silence) from error
-        finally:
-            with contextlib.suppress(RuntimeError):
-                dashboard.disconnect()
-        if "NORMAL" not in safety and "REDUCED" not in safety:
-            fault = Fault.EMERGENCY_STOP if "EMERGENCY" in safety else Fault.PROTECTIVE_STOP
-            raise RobotFaultError(fault, f"the safety status is '{safety}'")
-        if "RUNNING" not in mode:
-            raise RobotFaultError(Fault.NOT_RUNNING, f"the robot mode is '{mode}'")
-        if not is_remote:
-            raise RobotFaultError(Fault.PROGRAM_STOPPED, "the controller is in local control; make it remote")
 
     @check_if_not_connected
     def get_observation(self) -> RobotObservation:
@@ -142,6 +125,7 @@ class UR5eRobotiq(Robot):
         """
         with self._stopping_on_fault() as servo:
             measured, _ = servo.read()
+            self._tell_speed(servo.speed_scaling)
             closure = self._gripper.closure if self._gripper is not None else 0.0
             observation: dict[str, Any] = dict(zip(FEATURES, [*measured.tolist(), closure], strict=True))
             for name, camera in self.cameras.items():
@@ -195,6 +179,16 @@ class UR5eRobotiq(Robot):
             # What stops the arm can take the gripper's power, too; the servo, which asks the controller, knows better.
             self._fault = cause
             raise cause from fault
+
+    def _tell_speed(self, scaling: float) -> None:
+        if abs(scaling - self._speed_scaling) < SPEED_CHANGE:
+            return
+        self._speed_scaling = scaling
+        told = f"The controller scales the arm's speed to {100 * scaling:.0f} %"
+        if scaling > 1 - SPEED_CHANGE:
+            logger.info("%s again.", told)
+        else:
+            logger.warning("%s: it falls behind its targets. See the speed slider on the pendant.", told)
 
     def _release(self) -> None:
         self._servo = self._gripper = None

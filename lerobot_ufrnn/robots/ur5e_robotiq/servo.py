@@ -18,22 +18,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .configuration import UR5eRobotiqConfig
-from .faults import Fault, RobotFaultError
+from .controller import end_program
+from .faults import SAFETY_MODES, Fault, RobotFaultError, safety_fault
 
-START_SECONDS = 60.0  # that connecting may take; the client uploads a program and waits for it to run
+START_SECONDS = 20.0  # that connecting may take; the client uploads a program and waits for it to run
 STOP_DECELERATION = 4.0  # in rad/s^2, with which the arm is stopped
 SETTLE_SECONDS = 0.1  # that the values that tell of one cause may take to come in
 SILENT_SECONDS = 0.5  # beyond `stale_after` that the servo process may be silent; it tells of faults within that time
-STOP_SECONDS = 5.0  # that it may take to end by itself; by then the controller's watchdog has stopped the arm
+STOP_SECONDS = 3.0  # that it may take to end by itself; by then the controller's watchdog has stopped the arm
+HOPELESS_SECONDS = 0.5  # the same where it hardly can, or does not command the arm yet
+HOPELESS = (Fault.LINK_LOST, Fault.STALE_DATA, Fault.SERVO_LATE)
 
-# Modes as the controller numbers them.
-ROBOT_MODE_RUNNING = 7
-SAFETY_NORMAL, SAFETY_REDUCED = 1, 2
-STOPPED_BY_SAFETY = {3: Fault.PROTECTIVE_STOP, 6: Fault.EMERGENCY_STOP, 7: Fault.EMERGENCY_STOP}
+ROBOT_MODE_RUNNING = 7  # as the controller numbers its modes
 
 # What the servo tells; the moment is that of `time.monotonic()`, which all processes have in common.
-MEASURED, COMMANDED, FAULT, MOMENT = slice(0, 6), slice(6, 12), 12, 13
-STATE_SIZE = 14
+MEASURED, COMMANDED, FAULT, MOMENT, SPEED = slice(0, 6), slice(6, 12), 12, 13, 14
+STATE_SIZE = 15
 TEXT_SIZE = 400
 
 
@@ -90,7 +90,8 @@ class _Shared:
     def __init__(self, context: BaseContext):
         self.targets, self.state = Mailbox(context, 6), Mailbox(context, STATE_SIZE)
         self.text: Any = context.RawArray("c", TEXT_SIZE)
-        self.stop, self.ready = context.Event(), context.Event()
+        # Flags without the lock that an event has: a process that ends with it in hand would block the other for ever.
+        self.stop, self.ready = context.RawValue("b", False), context.RawValue("b", False)
 
 
 class Servo:
@@ -98,6 +99,7 @@ class Servo:
 
     def __init__(self, config: UR5eRobotiqConfig):
         self._config = config
+        self._ended = False
         context = multiprocessing.get_context("spawn")
         self._shared = _Shared(context)
         arguments = config, os.getpid(), self._shared
@@ -107,7 +109,8 @@ class Servo:
         """Connects and holds the arm where it is, or raises a `RobotFaultError`."""
         self._process.start()
         deadline = time.monotonic() + START_SECONDS
-        while not self._shared.ready.wait(0.05):
+        while not self._shared.ready.value:
+            time.sleep(0.02)
             if not self._process.is_alive() or time.monotonic() > deadline:
                 fault = self.fault
                 self.stop()
@@ -116,12 +119,19 @@ class Servo:
 
     def stop(self) -> None:
         """Decelerates the arm, ends the program on the controller and the process. Safe to call at any time."""
-        self._shared.stop.set()
-        if self._process.pid is not None:
-            self._process.join(STOP_SECONDS)
-            if self._process.is_alive():
-                self._process.kill()
-                self._process.join(timeout=1.0)
+        if self._ended or self._process.pid is None:
+            return
+        cause = self.fault
+        self._shared.stop.value = True
+        hopeless = not self._shared.ready.value or (cause is not None and cause.fault in HOPELESS)
+        self._process.join(HOPELESS_SECONDS if hopeless else STOP_SECONDS)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join(timeout=1.0)
+        # Whatever became of the process, nobody commands its program any more. What runs later is not ours to end.
+        if cause is None or cause.fault is not Fault.REGISTERS_IN_USE:
+            end_program(self._config.ip)
+        self._ended = True
 
     @property
     def fault(self) -> RobotFaultError | None:
@@ -130,14 +140,19 @@ class Servo:
         fault = Fault(int(values[FAULT]))
         if fault is not Fault.NONE:
             return RobotFaultError(fault, self._shared.text.value.decode(errors="replace") or "no details")
-        if self._process.pid is None or self._shared.stop.is_set():
+        if self._process.pid is None or self._shared.stop.value:
             return None
         if not self._process.is_alive():
             return RobotFaultError(Fault.SERVO_DIED, f"exit code {self._process.exitcode}")
         silent = time.monotonic() - values[MOMENT]
-        if self._shared.ready.is_set() and silent > self._config.stale_after + SILENT_SECONDS:
+        if self._shared.ready.value and silent > self._config.stale_after + SILENT_SECONDS:
             return RobotFaultError(Fault.SERVO_LATE, f"the servo process hangs: nothing heard of it for {silent:.1f} s")
         return None
+
+    @property
+    def speed_scaling(self) -> float:
+        """Fraction of the commanded speed, 0 to 1, to which the controller slows the arm."""
+        return float(self._shared.state.read()[1][SPEED])
 
     def read(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Measured and commanded joints in rad, (6,) each; raises a `RobotFaultError` if the arm was stopped."""
@@ -158,8 +173,8 @@ def _run(config: UR5eRobotiqConfig, owner: int, shared: _Shared) -> None:
     for name in ("SIGINT", "SIGHUP"):  # so does a terminal that is closed, where there is such a signal
         if (number := getattr(signal, name, None)) is not None:
             signal.signal(number, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: shared.stop.set())
     driver, link_works = _Driver(config, owner, shared), True
+    signal.signal(signal.SIGTERM, driver.end)
     try:
         driver.connect()
         driver.drive()
@@ -171,8 +186,8 @@ def _run(config: UR5eRobotiqConfig, owner: int, shared: _Shared) -> None:
         driver.tell(Fault.SERVO_DIED, f"{type(error).__name__}: {error}")
     if link_works:
         driver.halt()
-    # Over a broken link the client waits for minutes, reconnects by itself or aborts when it is destroyed. The watchdog
-    # has stopped the arm, so the process ends here and now.
+    # Over a broken link the client waits for minutes or aborts when it is destroyed. The watchdog has stopped the arm,
+    # so the process ends here and now.
     sys.stderr.flush()
     os._exit(0)
 
@@ -183,6 +198,7 @@ class _Driver:
     def __init__(self, config: UR5eRobotiqConfig, owner: int, shared: _Shared):
         self._config, self._owner, self._shared = config, owner, shared
         self._values = np.zeros(STATE_SIZE)
+        self._told_to_end = False
         self._control: Any = None
         self._receive: Any = None
 
@@ -194,31 +210,40 @@ class _Driver:
             self._receive = rtde_receive.RTDEReceiveInterface(config.ip, config.servo_frequency)
             self._control = rtde_control.RTDEControlInterface(config.ip, config.servo_frequency)
         except RuntimeError as error:
-            raise RobotFaultError(Fault.LINK_LOST, f"cannot connect to {config.ip}: {error}") from error
+            fault = Fault.REGISTERS_IN_USE if "in use" in str(error) else Fault.LINK_LOST
+            raise RobotFaultError(fault, f"cannot connect to {config.ip}: {error}") from error
         if not self._control.setWatchdog(config.watchdog_frequency):
             raise RobotFaultError(Fault.COMMAND_REFUSED, "the controller's watchdog could not be armed")
+        _forbid_connections()
+
+    def end(self, *_: object) -> None:
+        """Notes, as the handler of a signal, that somebody else than the owner wants the process to end."""
+        self._told_to_end = True
 
     def drive(self) -> None:
         """Sends set-points, on a straight line from target to target, until the owner ends it or something is wrong."""
         config, shared, values = self._config, self._shared, self._values
         control, receive = self._control, self._receive
         period = 1.0 / config.servo_frequency
-        commanded = np.array(receive.getActualQ())
-        begin = end = commanded
-        began, seen = time.monotonic(), shared.targets.read()[0]
+        target = commanded = np.array(receive.getActualQ())
+        step, left = np.zeros(6), 0.0  # rad a set-point, and set-points until the target is reached
+        seen = shared.targets.read()[0]
         stamp, stamped = receive.getTimestamp(), time.monotonic()
         due = time.monotonic()
-        while not shared.stop.is_set():
+        while not shared.stop.value:
             now = time.monotonic()
             if (newest := receive.getTimestamp()) != stamp:
                 stamp, stamped = newest, now
             self._check(now, stamped)
-            count, target = shared.targets.read()
+            count, newest_target = shared.targets.read()
             if count != seen:
-                seen, begin, end, began = count, commanded, target, now
-            progress = min((now - began) / config.control_period, 1.0)
+                seen, target, left = count, newest_target, config.control_period / period
+                step = (target - commanded) / left
+            # Counted in set-points, not in time: what is late is made up for by no jump, and each new target is begun
+            # at once, however soon the next one comes.
+            left = max(left - 1.0, 0.0)
+            wanted = target - step * left
             measured = np.array(receive.getActualQ())
-            wanted = begin + (end - begin) * progress
             # A blocked arm must not be leant against harder than agreed, however far it is pushed back between targets.
             commanded = np.clip(wanted, measured - config.command_limit, measured + config.command_limit)
             try:
@@ -232,8 +257,9 @@ class _Driver:
                 raise RobotFaultError(Fault.COMMAND_REFUSED, "the controller refused a set-point")
             # Each set-point kicks the watchdog. The client's `kickWatchdog` would overwrite it before it is read.
             values[MEASURED], values[COMMANDED], values[MOMENT] = measured, commanded, time.monotonic()
+            values[SPEED] = min(receive.getTargetSpeedFraction(), receive.getSpeedScaling())
             shared.state.write(values)
-            shared.ready.set()
+            shared.ready.value = True
             due += period
             if (behind := time.monotonic() - due) > 0:
                 if behind > config.stale_after:
@@ -268,6 +294,8 @@ class _Driver:
             silent = 1000 * (now - stamped)
             raise RobotFaultError(Fault.STALE_DATA, f"no new data from {self._config.ip} for {silent:.0f} ms")
         self._check_interruption()
+        if self._told_to_end:
+            raise RobotFaultError(Fault.SERVO_DIED, "somebody told the servo process to end (SIGTERM)")
         if os.getppid() != self._owner:
             raise RobotFaultError(Fault.OWNER_GONE, "the program that commanded it ended")
 
@@ -281,10 +309,24 @@ class _Driver:
 
     def _interruption(self) -> RobotFaultError | None:
         """Why the controller does not carry out commands, if it says so; the most telling reason first."""
-        if (safety := self._receive.getSafetyMode()) not in (SAFETY_NORMAL, SAFETY_REDUCED):
-            return RobotFaultError(STOPPED_BY_SAFETY.get(safety, Fault.PROTECTIVE_STOP), f"safety mode {safety}")
+        safety = self._receive.getSafetyMode()
+        if (stopped := safety_fault(SAFETY_MODES.get(safety, f"{safety}"))) is not None:
+            return stopped
         if (mode := self._receive.getRobotMode()) != ROBOT_MODE_RUNNING:
             return RobotFaultError(Fault.NOT_RUNNING, f"robot mode {mode} instead of {ROBOT_MODE_RUNNING} (running)")
         if not self._control.isProgramRunning():
             return RobotFaultError(Fault.PROGRAM_STOPPED, "the program on the controller is not running")
         return None
+
+
+def _forbid_connections() -> None:
+    """Lets this process open nothing more.
+
+    The client would otherwise connect again by itself, on a thread of its own as well as within a command, upload its
+    program anew and repeat the last set-point, without the watchdog and without a word.
+    """
+    with contextlib.suppress(ImportError):  # on Windows
+        import resource
+
+        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, most))  # beside the three files that every process has

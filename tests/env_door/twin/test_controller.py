@@ -37,6 +37,24 @@ def test_protective_stop_waits_before_it_can_be_unlocked(twin, dashboard, upload
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "status"),
+    [
+        ("safeguard_stop", "SAFEGUARD_STOP"),
+        ("recovery_mode", "RECOVERY"),
+        ("safety_violation", "VIOLATION"),
+    ],
+)
+def test_other_stops_end_by_themselves_and_leave_the_program_paused(twin, dashboard, upload, name, status):
+    upload()
+    twin.inject(name)
+    check(dashboard, ("safetystatus", f"Safetystatus: {status}", 0), ("programState", "PAUSED <unnamed>", 0))
+    twin.inject("emergency_stop")
+    twin.turn()
+    twin._loop.run_until_complete(twin.clear(name))  # which has been replaced
+    check(dashboard, ("safetystatus", "Safetystatus: ROBOT_EMERGENCY_STOP", 0))
+
+
 def test_power_comes_back_step_by_step(twin, connect, dashboard):
     twin.inject("emergency_stop")
     check(dashboard, ("robotmode", "Robotmode: POWER_OFF", 0), ("power on", "Powering on", 200))

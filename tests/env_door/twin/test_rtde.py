@@ -59,6 +59,25 @@ def test_inputs_belong_to_one_client_until_it_leaves(connect, rtde):
     assert other.exchange("I", names) == b"\x01INT32,DOUBLE"
 
 
+@pytest.mark.parametrize(("name", "only_commanding"), [("close_link", False), ("close_control", True)])
+def test_clients_are_hung_up_on_in_order_and_may_come_again(twin, connect, rtde, name, only_commanding):
+    commanding = connect(ports.RTDE)
+    commanding.exchange("I", b"input_int_register_0")
+    twin.inject(name)
+    assert not commanding.turn(3)
+    assert rtde.turn(3) == only_commanding
+    assert connect(ports.RTDE).exchange("I", b"input_int_register_0") == b"\x01INT32"
+
+
+def test_the_speed_slider_is_told(twin, rtde):
+    twin.inject("speed_slider", fraction=0.3)
+    ask_for(rtde, b"speed_scaling,target_speed_fraction")
+    rtde.exchange("S")
+    rtde.packages()
+    rtde.turn(5)
+    assert struct.unpack(">B2d", rtde.packages()[-1][1])[1:] == pytest.approx((0.3, 0.3))
+
+
 @pytest.mark.parametrize(
     "package",
     [b"\x00\x02U", b"\x00\x03U", b"\x00\x04U\x07", b"\x00\x05U\x01\x00", b"\x00\x04O\x00", b"\x00\x04I\xff"],

@@ -10,7 +10,7 @@ from waiting import wait_until
 
 from lerobot_ufrnn.robots.ur5e_robotiq import Fault, RobotFaultError, UR5eRobotiqConfig
 from lerobot_ufrnn.robots.ur5e_robotiq import gripper as gripper_module
-from lerobot_ufrnn.robots.ur5e_robotiq.gripper import RobotiqGripper
+from lerobot_ufrnn.robots.ur5e_robotiq.gripper import RobotiqGripper, ask
 
 
 @pytest.fixture
@@ -89,8 +89,74 @@ def test_what_breaks_before_or_while_connected_is_told(connect, breaks, fault, m
             gripper.move_to(0.5)
 
 
-def test_a_lesser_fault_only_says_that_it_is_not_ready(connect):
-    assert connect(FakeGripper(FLT=5)).closure == 0
+@pytest.mark.parametrize("waiting", [5, 7])
+def test_a_fault_that_only_waits_for_activation_is_ended_by_it(connect, waiting):
+    server = FakeGripper(FLT=waiting)
+    assert connect(server).closure == 0
+    assert server.sets("ACT") == ["SET ACT 0", "SET ACT 1 GTO 1"]
+
+
+@pytest.mark.parametrize("lost", [{"STA": 0, "ACT": 0}, {"FLT": 5}, {"FLT": 7}])
+def test_an_activation_that_is_lost_while_connected_is_told(connect, lost):
+    server = FakeGripper()
+    gripper = connect(server)
+    server.values.update(lost)
+    with pytest.raises(RobotFaultError, match="lost its activation") as told:
+        wait_until(lambda: gripper.closure < 0)
+    assert told.value.fault is Fault.GRIPPER_NOT_ACTIVE
+    assert "connect again" in str(told.value)
+
+
+def test_a_position_that_is_too_old_is_not_passed_off_as_measured(connect, monkeypatch):
+    gripper = connect(FakeGripper())
+    wait_until(lambda: gripper.closure == 0)
+    monkeypatch.setattr(gripper_module, "MAX_AGE", 0.0)
+    with pytest.raises(RobotFaultError, match=r"position is .* s old") as told:
+        wait_until(lambda: gripper.closure < 0)
+    assert told.value.fault is Fault.GRIPPER_SILENT
+
+
+def test_a_position_that_grew_old_while_the_program_was_held_up_is_replaced(connect):
+    server = FakeGripper()
+    gripper = connect(server)
+    server.values["POS"] = 230
+    gripper._asked -= 10.0
+    gripper._position = 3
+    assert gripper.closure == 1.0
+
+
+class Pieces:
+    """A connection on which an answer comes in so many pieces."""
+
+    def __init__(self, *pieces: bytes):
+        self._pieces = list(pieces)
+
+    def sendall(self, data):
+        assert data.endswith(b"\n")
+
+    def gettimeout(self):
+        return 0.3
+
+    def settimeout(self, seconds):
+        pass
+
+    def recv(self, size):
+        if not self._pieces:
+            raise TimeoutError("timed out")
+        return self._pieces.pop(0)
+
+
+@pytest.mark.parametrize(
+    "pieces", [(b"POS 116",), (b"POS 116\n",), (b"PO", b"S 116\n"), (b"POS 1", b"16"), (b"POS", b" 1", b"16\r\n")]
+)
+def test_an_answer_may_come_in_pieces(pieces):
+    assert ask(Pieces(*pieces), "GET POS", r"POS\s+(\d+)") == "116"
+
+
+@pytest.mark.parametrize("pieces", [(b"PO",), (b"PO", b""), (b"?\n",), (b"POS 1x",)])
+def test_what_is_no_answer_is_quoted(pieces):
+    with pytest.raises(ConnectionError, match=pieces[0].decode().strip().replace("?", r"\?")):
+        ask(Pieces(*pieces), "GET POS", r"POS\s+(\d+)")
 
 
 def test_disconnecting_neither_opens_nor_closes(connect):

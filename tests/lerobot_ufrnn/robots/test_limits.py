@@ -34,6 +34,8 @@ ACTION = dict(zip(FEATURES, [*HOME, 0.5], strict=True))
         ),
         (dict(list(ACTION.items())[:4]), r"must have exactly .*nothing was sent"),
         (ACTION | {"joint_7.pos": 0.0}, "joint_7"),
+        (ACTION | {"elbow.pos": "1.5"}, r"must be numbers, got \{'elbow.pos': '1.5'\}; nothing was sent"),
+        (ACTION | {"gripper.pos": None}, r"must be numbers, got \{'gripper.pos': None\}; nothing was sent"),
     ],
 )
 def test_what_is_no_action_is_refused_by_name(action, reason):

@@ -1,6 +1,11 @@
 """The robot on the digital twin, through the real client library: what it does, and what it does when it fails."""
 
 import importlib
+import logging
+import os
+import signal
+import socket
+import struct
 import sys
 import time
 
@@ -13,7 +18,7 @@ from waiting import wait_until
 
 pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
 
-from env_door.twin import TwinProcess
+from env_door.twin import TwinProcess, ports
 from lerobot_ufrnn.robots.ur5e_robotiq import Fault, RobotFaultError, UR5eRobotiq, UR5eRobotiqConfig
 
 pytestmark = pytest.mark.real_time
@@ -115,6 +120,37 @@ def test_a_jump_is_limited_and_what_was_sent_is_told_and_what_is_no_action_is_re
     assert np.abs(measured(connected) - start).max() <= connected.config.command_limit + 5e-3
 
 
+@pytest.mark.parametrize("rate", [10, 60, 125])
+def test_no_motion_is_lost_whatever_the_rate_of_actions(twin, connected, rate):
+    speed, way = 0.4, 0.6  # rad/s and rad of the last joint
+    start = measured(connected)
+    begin = time.monotonic()
+    for number in range(1, round(rate * way / speed) + 1):
+        time.sleep(max(begin + number / rate - time.monotonic(), 0.0))
+        fraction = min((time.monotonic() - begin) * speed / way, 1.0)
+        connected.send_action(action_of(start + np.array([0, 0, 0, 0, 0, fraction * way])))
+    connected.send_action(action_of(start + np.array([0, 0, 0, 0, 0, way])))
+    time.sleep(0.5)
+    assert measured(connected)[-1] - start[-1] == pytest.approx(way, abs=5e-3)
+
+
+def test_a_speed_slider_that_is_not_at_its_end_is_told_at_connect_and_on_change(twin, robot, caplog):
+    def told():
+        return [record.getMessage() for record in caplog.records if "speed" in record.getMessage()]
+
+    caplog.set_level(logging.INFO)
+    twin.inject("speed_slider", fraction=0.2)
+    robot.connect()
+    assert len(told()) == 1
+    assert "20 %" in told()[0]
+    for fraction in (0.5, 1.0):
+        twin.inject("speed_slider", fraction=fraction)
+        time.sleep(0.3)
+        for _ in range(3):
+            robot.get_observation()
+    assert ["50 %" in told()[1], "100 %" in told()[2], len(told())] == [True, True, 3]
+
+
 # ── Faults ────────────────────────────────────────────────────────────
 
 
@@ -123,6 +159,8 @@ def test_a_jump_is_limited_and_what_was_sent_is_told_and_what_is_no_action_is_re
     ("name", "parameters", "fault"),
     [
         ("drop_link", {}, Fault.LINK_LOST),
+        ("close_link", {}, Fault.LINK_LOST),
+        ("close_control", {}, Fault.LINK_LOST),
         ("freeze", {}, Fault.STALE_DATA),
         ("delay", {"ms": 500}, Fault.STALE_DATA),
         ("protective_stop", {}, Fault.PROTECTIVE_STOP),
@@ -133,6 +171,11 @@ def test_a_jump_is_limited_and_what_was_sent_is_told_and_what_is_no_action_is_re
         ("gripper_garbage", {}, Fault.GRIPPER_SILENT),
         ("gripper_gone", {}, Fault.GRIPPER_SILENT),
         ("gripper_fault", {}, Fault.GRIPPER_FAULT),
+        ("gripper_fault", {"code": 5}, Fault.GRIPPER_NOT_ACTIVE),
+        ("gripper_reset", {}, Fault.GRIPPER_NOT_ACTIVE),
+        ("safeguard_stop", {}, Fault.SAFEGUARD_STOP),
+        ("recovery_mode", {}, Fault.RECOVERY_MODE),
+        ("safety_violation", {}, Fault.SAFETY_VIOLATION),
     ],
 )
 def test_whatever_fails_stops_the_arm_and_leaves_it_stopped(twin, connected, name, parameters, fault):
@@ -163,7 +206,11 @@ def test_whatever_fails_stops_the_arm_and_leaves_it_stopped(twin, connected, nam
         ("emergency_stop", Fault.EMERGENCY_STOP, "safety status"),
         ("protective_stop", Fault.PROTECTIVE_STOP, "safety status"),
         ("power_off", Fault.NOT_RUNNING, "robot mode"),
-        ("remote_control_off", Fault.PROGRAM_STOPPED, "local control"),
+        ("remote_control_off", Fault.LOCAL_CONTROL, "local control"),
+        ("safeguard_stop", Fault.SAFEGUARD_STOP, "safety status"),
+        ("recovery_mode", Fault.RECOVERY_MODE, "safety status"),
+        ("safety_violation", Fault.SAFETY_VIOLATION, "safety status"),
+        ("freeze", Fault.LINK_LOST, "port 30004"),
         ("gripper_gone", Fault.GRIPPER_SILENT, "does not answer"),
         ("gripper_fault", Fault.GRIPPER_FAULT, "reports fault"),
     ],
@@ -211,3 +258,77 @@ def test_if_the_servo_process_is_killed_the_watchdog_stops_the_arm(twin, connect
     connected._servo._process.kill()
     assert until_it_fails(connected).fault is Fault.SERVO_DIED
     assert_still(twin)
+
+
+def test_a_servo_process_that_somebody_else_ends_is_told_and_nothing_goes_on(twin, connected):
+    move(connected, TURN, 2)
+    os.kill(connected._servo._process.pid, signal.SIGTERM)
+    wait_until(lambda: not connected._servo._process.is_alive())
+    for use in (connected.get_observation, lambda: connected.send_action(action_of(np.zeros(6), gripper=1.0))):
+        with pytest.raises(RobotFaultError) as told:
+            use()
+        assert told.value.fault is Fault.SERVO_DIED
+    assert_still(twin)
+    assert twin.state()["targets"]["gripper"] == 0.0
+    wait_until(lambda: twin.state()["program"] == "STOPPED", 2.0)
+
+
+@pytest.mark.parametrize("name", ["close_link", "close_control"])
+def test_a_link_that_closes_in_order_is_lost_and_leaves_no_program_behind(twin, connected, name):
+    move(connected, TURN, 2)
+    twin.inject(name)
+    assert until_it_fails(connected).fault is Fault.LINK_LOST
+    wait_until(lambda: twin.state()["program"] == "STOPPED", 2.0)
+    for _ in range(10):
+        time.sleep(0.1)
+        assert twin.state()["program"] == "STOPPED"
+        assert twin.state()["rtde_clients"] == 0
+    connected.disconnect()
+    connected.connect()
+    move(connected, TURN, 1)
+
+
+def test_disconnecting_later_does_not_stop_what_the_operator_has_started_meanwhile(twin, connected):
+    twin.inject("script_stop")
+    until_it_fails(connected)
+    start_a_program(twin)
+    connected.disconnect()
+    time.sleep(0.2)
+    assert twin.state()["program"] == "PLAYING"
+
+
+def start_a_program(twin: TwinProcess) -> None:
+    """Starts what nobody commands."""
+    with socket.create_connection((twin.address, ports.SCRIPT[-1])) as connection:
+        connection.sendall(b"def rtde_control():\n    global reg_offset_int = # int register offset\n0\nend\n")
+    wait_until(lambda: twin.state()["program"] == "PLAYING", 2.0)
+
+
+def test_a_program_that_runs_already_is_stopped_only_if_that_is_asked_for(twin, robot):
+    start_a_program(twin)
+    with pytest.raises(RobotFaultError, match=r"PLAYING.*stop_running_program=true") as told:
+        robot.connect()
+    assert told.value.fault is Fault.PROGRAM_RUNNING
+    assert twin.state()["program"] == "PLAYING"
+    bold = make_robot(twin.address, stop_running_program=True)
+    bold.connect()
+    move(bold, TURN, 1)
+    bold.disconnect()
+    assert twin.state()["program"] == "STOPPED"
+
+
+def test_who_comes_second_does_not_disturb_the_first(twin, connected):
+    with pytest.raises(RobotFaultError) as told:
+        make_robot(twin.address).connect()
+    assert told.value.fault is Fault.PROGRAM_RUNNING
+    move(connected, TURN, 1)
+
+
+def test_registers_that_somebody_else_writes_are_told_with_what_to_do(twin, robot):
+    with socket.create_connection((twin.address, ports.RTDE)) as fieldbus:
+        names = b"input_int_register_0"
+        fieldbus.sendall(struct.pack(">HB", 3 + len(names), ord("I")) + names)
+        fieldbus.recv(100)
+        with pytest.raises(RobotFaultError, match="EtherNet/IP") as told:
+            robot.connect()
+    assert told.value.fault is Fault.REGISTERS_IN_USE
