@@ -20,7 +20,7 @@ from lerobot.datasets.io_utils import load_info, load_stats, load_tasks
 from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR, INFO_PATH, STATS_PATH, DatasetInfo
 from PIL import Image
 
-UNREADABLE = (OSError, ValueError, LookupError, TypeError, pa.ArrowException, av.FFmpegError)
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, pa.ArrowException, av.FFmpegError)
 # Columns that tell to which episode and place a row belongs.
 PLACE = ("index", "episode_index", "frame_index", "task_index")
 
@@ -216,9 +216,10 @@ class _Inspector:
             if trouble or held.get(file, self.used[file]) != self.used[file]:
                 found.spoilt.add(file)
                 found.faults.append(f"{file} holds more than the whole episodes{trouble}")
-        for folder in sorted(self.root.iterdir()):
-            streamed = folder.name.startswith("tmp") and folder.is_dir() and not folder.is_symlink()
-            if (streamed and all(path.suffix == ".mp4" for path in folder.iterdir())) or folder.name == "images":
+        for folder in sorted(path for path in self.root.iterdir() if path.is_dir() and not path.is_symlink()):
+            files = [path.suffix for path in folder.rglob("*") if path.is_file()]
+            streamed = folder.name.startswith("tmp") and set(files) <= {".mp4"}
+            if streamed or (folder.name == "images" and files):
                 found.useless.add(folder.relative_to(self.root))
                 found.faults.append(f"{folder.name}/ was left by an episode that was not saved")
 
@@ -267,7 +268,8 @@ def decoded_times(path: Path) -> tuple[np.ndarray, str]:
                     times += [frame.time for frame in packet.decode()]
             except (*UNREADABLE, EOFError) as error:
                 trouble = f" ({_brief(error)})"
-                times += [frame.time for frame in stream.codec_context.decode(None)]
+                rest = stream.codec_context.decode(None)  # these do not know the time base
+                times += [float(frame.pts * stream.time_base) for frame in rest]
     except (*UNREADABLE, EOFError) as error:
         trouble = trouble or f" ({_brief(error)})"
     return np.sort(times), trouble

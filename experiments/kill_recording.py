@@ -13,7 +13,9 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from functools import cache
+from multiprocessing import forkserver, get_context
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,7 @@ from script import run
 
 from env_door.checks import check_range
 from env_door.demonstration import Demonstration
-from env_door.inspection import inspect
+from env_door.inspection import files_of_episodes, inspect
 from env_door.recording import record_demonstrations
 from env_door.recording_config import DatasetConfig
 from lerobot_ufrnn.analysis.results import markdown
@@ -153,7 +155,7 @@ def record_and_kill(name: str, root: Path, first: int, seconds: float) -> tuple[
     """Records, kills after some time; returns how many episodes there were before, and how many were saved at the end."""
     log = root.parent / f"{root.name}.log"
     log.unlink(missing_ok=True)
-    process = CONTEXT.Process(target=work, args=(name, root, first, log))
+    process = forking().Process(target=work, args=(name, root, first, log))
     process.start()
     deadline = time.monotonic() + START_SECONDS
     while (before := saved_episodes(log)) is None:
@@ -172,8 +174,17 @@ def record_and_kill(name: str, root: Path, first: int, seconds: float) -> tuple[
     return before, saved
 
 
-CONTEXT = get_context("forkserver")
-CONTEXT.set_forkserver_preload([Path(__file__).stem])
+@cache
+def forking() -> ForkServerContext:
+    """Starts processes as forks of one that has imported all of this, as LeRobot takes long to import."""
+    context, outside = get_context("forkserver"), os.environ.get("PYTHONPATH", "")
+    context.set_forkserver_preload([Path(__file__).stem])
+    try:
+        os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)
+        forkserver.ensure_running()
+    finally:
+        os.environ["PYTHONPATH"] = outside
+    return context
 
 
 # ── What is there afterwards ──────────────────────────────────────────
@@ -213,9 +224,15 @@ def readable_episodes(root: Path) -> int | str:
     return len(episodes)
 
 
+def was_saving(root: Path) -> bool:
+    """Whether a killed recording had begun to write an episode that is not in the dataset."""
+    staged = root.parent / f".{root.name}.staging" / "staged"
+    return any(not (root / path.relative_to(staged)).exists() for path in files_of_episodes(staged))
+
+
 def kill(name: str, kills: int, seconds: float, rng: random.Random, folder: Path) -> dict[str, object]:
     """Kills one way to record again and again; returns a row of the table."""
-    row = {"command": name, "kills": kills, "while saving": 0, "saved": 0, "lost": 0, "unreadable": 0, "left over": 0}
+    counts = dict.fromkeys(("while saving", "episodes saved", "episodes lost", "unreadable", "with leftovers"), 0)
     number, session, readable = 0, 0, 0
     for _ in range(kills):
         root = folder / f"{number}"
@@ -223,37 +240,37 @@ def kill(name: str, kills: int, seconds: float, rng: random.Random, folder: Path
         if before != readable:
             raise RuntimeError(f"{name} went on with {before} of {readable} episodes")
         found, session = readable_episodes(root), session + 1
-        row["saved"] += saved - before
+        counts["episodes saved"] += saved - before
         if isinstance(found, str):
             print(f"{name}: {saved} saved episodes cannot be read ({found})", flush=True)
-            row["unreadable"] += 1
-            row["lost"] += saved
+            counts["unreadable"] += 1
+            counts["episodes lost"] += saved
         else:
             print(f"{name}: {saved} episodes were saved, {found} can be read", flush=True)
-            row["lost"] += max(saved - found, 0)
-            row["while saving"] += found > saved  # killed between the last step of saving and its return
-            row["left over"] += bool(root.exists() and inspect(root).faults)
+            counts["episodes lost"] += max(saved - found, 0)
+            counts["while saving"] += found > saved or was_saving(root)
+            counts["with leftovers"] += root.exists() and bool(inspect(root).faults)
         readable = found if isinstance(found, int) else MAX_EPISODES
         if readable >= MAX_EPISODES:
             number, readable = number + 1, 0
-    return row
+    return {"command": name, "kills": kills, **counts}
 
 
 def main(config: KillConfig) -> None:
     """Kills, prints the table and writes it; fails if one of our ways to record lost anything."""
     rng, rows = random.Random(config.seed), []
-    shares = [config.kills * (place + 1) // len(RECORDERS) - config.kills * place // len(RECORDERS) for place in range(5)]
+    ends = [config.kills * place // len(RECORDERS) for place in range(len(RECORDERS) + 1)]
     with tempfile.TemporaryDirectory() as folder:
-        for name, kills in zip(RECORDERS, shares, strict=True):
+        for name, kills in zip(RECORDERS, np.diff(ends), strict=True):
             path = Path(folder) / f"{len(rows)}"
             path.mkdir()
-            rows.append(kill(name, kills, config.max_seconds, rng, path))
+            rows.append(kill(name, int(kills), config.max_seconds, rng, path))
     table = markdown(pd.DataFrame(rows))
     print(table)
     if config.output:
         config.output.parent.mkdir(parents=True, exist_ok=True)
         config.output.write_text(table)
-    if any(row["lost"] or row["unreadable"] or row["left over"] for row in rows if row["command"] != STOCK):
+    if any(row["episodes lost"] or row["unreadable"] or row["with leftovers"] for row in rows if row["command"] != STOCK):
         raise RuntimeError("episodes were lost whose saving had returned")
 
 

@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from env_door.inspection import inspect
+import av
+
 from env_door import repair
+from env_door.inspection import inspect
 
 
 @dataclass
@@ -19,6 +21,7 @@ class RepairConfig:
 
 def run(config: RepairConfig) -> None:
     """Repairs, and says what was kept and why the rest was not; a whole data set is left untouched."""
+    av.logging.set_libav_level(av.logging.PANIC)  # what it would say of damaged videos is said below
     root = config.root.expanduser().resolve()
     found = inspect(root) if config.dry_run else repair.repair(root)
     kept = f"{len(found.episodes)} episodes ({found.num_frames} frames)"
