@@ -1,7 +1,7 @@
 """Find out what of a LeRobotDataset is whole: after a kill, a loss of power, a full disk.
 
-An episode is whole if its metadata, all of its rows and all frames of its videos can be read. As LeRobot numbers episodes
-without gaps, what counts are the whole episodes from the first on.
+An episode is whole if its metadata, all of its rows and all frames of its videos can be read. What counts are the whole
+episodes from the first on, as LeRobot numbers episodes without gaps.
 """
 
 import io
@@ -30,7 +30,9 @@ class Inspection:
     """What is whole of a dataset."""
 
     info: DatasetInfo
-    tasks: pd.DataFrame | None = None
+    tasks: pd.DataFrame = field(
+        default_factory=lambda: pd.DataFrame({"task_index": []}, index=pd.Index([], name="task"), dtype="int64")
+    )
     """Number of each task by its words, as LeRobot keeps them."""
     episodes: list[dict[str, Any]] = field(default_factory=list)
     """Metadata of the whole episodes, from the first on."""
@@ -97,6 +99,7 @@ class _Inspector:
     def __init__(self, root: Path, decode: bool):
         self.root, self.decode = root, decode
         self.found = Inspection(_read_info(root))
+        self.lost_tasks = False
         self.rows_of: dict[Path, tuple[pd.DataFrame, str]] = {}  # of data files, as far as they can be read
         self.frames_of: dict[Path, tuple[np.ndarray, str]] = {}  # of videos, as far as they can be decoded
         self.used: dict[Path, int] = {}  # rows of whole episodes in each file; of videos, frames
@@ -120,10 +123,8 @@ class _Inspector:
         try:
             self.found.tasks = load_tasks(self.root)
         except UNREADABLE as error:
+            self.lost_tasks = True
             self.found.faults.append(f"{DEFAULT_TASKS_PATH} cannot be read ({_brief(error)})")
-        self.lost_tasks = self.found.tasks is None
-        if self.lost_tasks:
-            self.found.tasks = pd.DataFrame({"task_index": []}, index=pd.Index([], name="task"), dtype="int64")
 
     def _read_metadata(self) -> Iterator[tuple[Path, dict[str, Any]]]:
         for path in sorted((self.root / EPISODES_DIR).glob("*/*.parquet")):
@@ -198,9 +199,10 @@ class _Inspector:
         except UNREADABLE as error:
             found.faults.append(f"{STATS_PATH} cannot be read ({_brief(error)})")
             return
-        if stats is None or ("index" in stats and int(stats["index"]["count"][0]) != found.num_frames):
-            if found.episodes and statistics(found.episodes[:1], info) is not None:
-                found.faults.append(f"{STATS_PATH} does not fit these episodes" if stats else f"{STATS_PATH} is missing")
+        if stats is None and statistics(found.episodes[:1], info) is not None:
+            found.faults.append(f"{STATS_PATH} is missing")
+        elif stats and "index" in stats and int(stats["index"]["count"][0]) != found.num_frames:
+            found.faults.append(f"{STATS_PATH} is not of these episodes")
 
     def _compare_files(self, metadata: list[Path]) -> None:
         found = self.found
@@ -261,15 +263,15 @@ def decoded_times(path: Path) -> tuple[np.ndarray, str]:
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
+            unit = float(stream.time_base or 1)
             try:
                 for packet in container.demux(stream):
                     if packet.is_corrupt:
                         raise EOFError("it is cut short")
-                    times += [frame.time for frame in packet.decode()]
+                    times += [float(frame.pts or 0) * unit for frame in stream.decode(packet)]
             except (*UNREADABLE, EOFError) as error:
                 trouble = f" ({_brief(error)})"
-                rest = stream.codec_context.decode(None)  # these do not know the time base
-                times += [float(frame.pts * stream.time_base) for frame in rest]
+                times += [float(frame.pts or 0) * unit for frame in stream.decode(None)]
     except (*UNREADABLE, EOFError) as error:
         trouble = trouble or f" ({_brief(error)})"
     return np.sort(times), trouble
@@ -282,7 +284,7 @@ def _claimed_times(path: Path) -> tuple[np.ndarray, str]:
             stream = container.streams.video[0]
             container.seek(stream.duration or 0, stream=stream)
             whole = not any(packet.is_corrupt for packet in container.demux(stream))
-            times = np.arange(stream.frames) / float(stream.average_rate)
+            times = np.arange(stream.frames) / float(stream.average_rate or 1)
     except UNREADABLE:
         whole = False
     return (times, "") if whole else decoded_times(path)

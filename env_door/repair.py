@@ -105,7 +105,7 @@ def _keep_frames(path: Path, part: Path, end: float) -> None:
             for packet in source.demux(stream):
                 if packet.is_corrupt:
                     break
-                if packet.dts is not None and packet.pts * packet.time_base < end:
+                if packet.dts is not None and (packet.pts or 0) * float(packet.time_base or 1) < end:
                     packet.stream = copy
                     target.mux(packet)
         except UNREADABLE:

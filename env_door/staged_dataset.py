@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 
 class _OneFilePerEpisode(LeRobotDatasetMetadata):
-    """Begins new files with each episode: closed parquet files cannot be continued, and no earlier file is rewritten."""
+    """Begins new files with each episode: parquet files cannot be continued once closed, and earlier files stay."""
 
     data_files_size_in_mb = 0
     video_files_size_in_mb = 0

@@ -5,7 +5,7 @@ For `--robot.discover_packages_path=counting_robot --robot.type=counting_robot -
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from lerobot.robots import Robot, RobotConfig
@@ -41,10 +41,6 @@ class Counting:
 
     is_calibrated, is_connected = True, False
 
-    def __init__(self, config: Any):
-        super().__init__(config)
-        self.count = config.first
-
     @cached_property
     def action_features(self) -> dict[str, type]:
         return {JOINT: float}
@@ -68,6 +64,10 @@ class CountingRobot(Counting, Robot):
     config_class, name = CountingRobotConfig, "counting_robot"
     cameras = (CAMERA,)
 
+    def __init__(self, config: CountingRobotConfig):
+        super().__init__(config)
+        self.count = config.first
+
     @cached_property
     def observation_features(self) -> dict[str, Any]:
         return {JOINT: float, CAMERA: (SIZE, SIZE, 3)}
@@ -84,7 +84,11 @@ class CountingTeleop(Counting, Teleoperator):
     """Commands half a count more than the robot observes."""
 
     config_class, name = CountingTeleopConfig, "counting_teleop"
-    feedback_features: dict[str, type] = {}
+    feedback_features: ClassVar[dict[str, type]] = {}
+
+    def __init__(self, config: CountingTeleopConfig):
+        super().__init__(config)
+        self.count = config.first
 
     def get_action(self) -> dict[str, Any]:
         self.count += 1

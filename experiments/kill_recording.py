@@ -1,8 +1,8 @@
 """Is every saved episode kept when a recording is killed? Recordings are killed (SIGKILL) at random moments.
 
-A robot that counts is recorded by stock `lerobot-record` and by `ufrnn lerobot-record`, demonstrations that count by our
-recorder. After each kill the dataset must be readable as it is and hold, frame by frame, every episode whose saving had
-returned; then the next recording goes on with it until it is killed, too.
+A robot that counts is recorded by stock `lerobot-record` and by `ufrnn lerobot-record`, demonstrations that count by
+our recorder. After each kill the dataset must be readable as it is and hold, frame by frame, every episode whose saving
+had returned; then the next recording goes on with it until it is killed, too.
 """
 
 import os
@@ -103,7 +103,8 @@ class CountedConfig(DatasetConfig):
 class CountedEnv:
     """What our recorder asks of an environment."""
 
-    joint_names, task_description = ("joint",), "count"
+    joint_names: tuple[str, ...] = ("joint",)
+    task_description = "count"
 
 
 def ours(root: Path, first: int, num_episodes: int) -> None:
@@ -114,7 +115,7 @@ def ours(root: Path, first: int, num_episodes: int) -> None:
             print(f"Recording episode {2 * seed}", flush=True)  # as LeRobot does: those before it are saved
         counts = np.arange(STEPS) + (2 * seed + (kind == "two")) * STEPS
         states = counts[:, None].astype(np.float32)
-        images = np.stack([picture(count) for count in counts])
+        images = np.stack([picture(int(count)) for count in counts])
         return Demonstration(kind, seed, images, states, states + 0.5, branch_step=1, success_step=2)
 
     config = CountedConfig(REPO_ID, root, episodes_per_kind=num_episodes, resume=True)
@@ -147,12 +148,14 @@ def work(name: str, root: Path, first: int, log: Path, num_episodes: int = 1000)
 def saved_episodes(log: Path) -> int | None:
     """Number of the last episode that was begun, as all before it are saved; `None` if none was."""
     text = log.read_text(errors="replace") if log.exists() else ""
-    begun = [line.split("Recording episode ")[1].split()[0] for line in text.splitlines() if "Recording episode " in line]
+    begun = [
+        line.split("Recording episode ")[1].split()[0] for line in text.splitlines() if "Recording episode " in line
+    ]
     return int(begun[-1]) if begun else None
 
 
 def record_and_kill(name: str, root: Path, first: int, seconds: float) -> tuple[int, int]:
-    """Records, kills after some time; returns how many episodes there were before, and how many were saved at the end."""
+    """Records and kills after some time; returns how many episodes there were before, and how many were saved."""
     log = root.parent / f"{root.name}.log"
     log.unlink(missing_ok=True)
     process = forking().Process(target=work, args=(name, root, first, log))
@@ -199,7 +202,10 @@ def read_counts(root: Path) -> list[list[int]]:
     for item in (dataset[index] for index in range(dataset.num_frames)):
         count, image = float(item["observation.state"].reshape(-1)[0]), item[f"observation.images.{CAMERA}"]
         image = np.asarray(image * 255 if image.is_floating_point() else image, np.float32)
-        if float(item["action"].reshape(-1)[0]) != count + 0.5 or np.abs(image - picture(int(count))[0, 0, 0]).max() > 6:
+        if (
+            float(item["action"].reshape(-1)[0]) != count + 0.5
+            or np.abs(image - picture(int(count))[0, 0, 0]).max() > 6
+        ):
             raise ValueError(f"frame {int(item['index'])} is not what was recorded at {JOINT}={count}")
         episodes[int(item["episode_index"])].append(int(count))
     return episodes
@@ -258,7 +264,8 @@ def kill(name: str, kills: int, seconds: float, rng: random.Random, folder: Path
 
 def main(config: KillConfig) -> None:
     """Kills, prints the table and writes it; fails if one of our ways to record lost anything."""
-    rng, rows = random.Random(config.seed), []
+    rng = random.Random(config.seed)
+    rows: list[dict[str, object]] = []
     ends = [config.kills * place // len(RECORDERS) for place in range(len(RECORDERS) + 1)]
     with tempfile.TemporaryDirectory() as folder:
         for name, kills in zip(RECORDERS, np.diff(ends), strict=True):
@@ -270,7 +277,9 @@ def main(config: KillConfig) -> None:
     if config.output:
         config.output.parent.mkdir(parents=True, exist_ok=True)
         config.output.write_text(table)
-    if any(row["episodes lost"] or row["unreadable"] or row["with leftovers"] for row in rows if row["command"] != STOCK):
+    if any(
+        row["episodes lost"] or row["unreadable"] or row["with leftovers"] for row in rows if row["command"] != STOCK
+    ):
         raise RuntimeError("episodes were lost whose saving had returned")
 
 

@@ -1,4 +1,4 @@
-"""Damaged datasets are repaired to the whole episodes from the first on; what these are is known from what was recorded."""
+"""Damaged datasets are repaired to the whole episodes from the first on, judged by what was recorded."""
 
 import json
 import os
@@ -226,7 +226,9 @@ def test_what_cannot_be_repaired_is_refused_and_left_as_it_was(spoil, message, v
 
 def test_our_own_record_of_the_episodes_is_shortened_with_them(videos):
     path = videos / "meta/door_recording.json"
-    path.write_text(json.dumps({"settings": {}, "episodes": [{"seed": seed} for seed in range(5)], "dropped_seeds": []}))
+    path.write_text(
+        json.dumps({"settings": {}, "episodes": [{"seed": seed} for seed in range(5)], "dropped_seeds": []})
+    )
     cut(videos / DATA.format("001"))
     repair(videos)
     assert [episode["seed"] for episode in json.loads(path.read_text())["episodes"]] == [0, 1, 2]
@@ -235,7 +237,7 @@ def test_our_own_record_of_the_episodes_is_shortened_with_them(videos):
 def test_a_repair_that_is_killed_loses_nothing(videos, recorded):
     cut(videos / DATA.format("001"))
     before = everything(videos)
-    delay, undone = 0.02, 0
+    delay, undone = 0.01, 0
     while everything(videos) == before:
         process = forking().Process(target=repair, args=(videos,))
         process.start()
@@ -244,7 +246,7 @@ def test_a_repair_that_is_killed_loses_nothing(videos, recorded):
             os.kill(process.pid, signal.SIGKILL)
             undone += 1
         process.join()
-        delay *= 1.4
+        delay *= 1.3
     assert undone > 2
     with pytest.raises(ValueError, match="is no LeRobotDataset"):
         repair(videos.parent)
