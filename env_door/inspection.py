@@ -115,6 +115,9 @@ class _Inspector:
                 break
             found.episodes.append(row)
             self._use(file, row)
+        else:
+            if len(metadata) < found.num_claimed:
+                found.faults.append(f"episode {len(metadata)}: its metadata is missing")
         self._compare_summaries()
         self._compare_files([file for file, _ in metadata])
         return found

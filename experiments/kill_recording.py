@@ -35,7 +35,7 @@ from lerobot_ufrnn.commands import lerobot_record as kept_record
 
 REPO_ID, FPS = "tester/counted", 30
 SESSION = 10_000  # from which count to which one recording may count
-EPISODE_SECONDS, STEPS = 0.4, 8  # of one episode of the robot, of one demonstration
+EPISODE_SECONDS, STEPS = 0.15, 8  # of an episode of the robot, of a demonstration; short, so that most is saving
 MAX_EPISODES = 16  # of a dataset; then another is begun
 START_SECONDS = 120.0  # longest time until a recording records
 
@@ -259,7 +259,8 @@ def kill(name: str, kills: int, seconds: float, rng: random.Random, folder: Path
         readable = found if isinstance(found, int) else MAX_EPISODES
         if readable >= MAX_EPISODES:
             number, readable = number + 1, 0
-    return {"command": name, "kills": kills, **counts}
+    unknown = {"while saving": "-", "with leftovers": "-"} if name == STOCK else {}
+    return {"command": name, "kills": kills, **counts, **unknown}
 
 
 def main(config: KillConfig) -> None:
