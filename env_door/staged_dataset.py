@@ -8,6 +8,7 @@ step (see [`~env_door.staging`]).
 import contextlib
 import logging
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +45,7 @@ class StagedDataset(LeRobotDataset):
             FileExistsError: If the folder holds something.
             OSError: If the place is not writable, or another process records into it.
         """
-        path = _resolve(repo_id, root)
-        if not is_empty(path):
-            raise FileExistsError(f"{path} is not empty. Use --resume=true to record more into it, or another root.")
-        return cls._open(super().create, path, repo_id, *args, **options)
+        return cls._open(super().create, _refuse_to_overwrite, root, repo_id, *args, **options)
 
     @classmethod
     def resume(cls, repo_id: str, *args: Any, root: str | Path | None = None, **options: Any) -> "StagedDataset":
@@ -58,26 +56,29 @@ class StagedDataset(LeRobotDataset):
             ValueError: If the folder is no LeRobotDataset, or a damaged one.
             OSError: If the place is not writable, or another process records into it.
         """
-        path = _resolve(repo_id, root)
-        if is_empty(path):
-            raise FileNotFoundError(f"{path} holds nothing to go on with. Leave out --resume, or name another root.")
-        return cls._open(super().resume, path, repo_id, *args, **options)
+        return cls._open(super().resume, _refuse_unless_whole, root, repo_id, *args, **options)
 
     @classmethod
-    def _open(cls, make: Any, path: Path, *args: Any, batch_encoding_size: int = 1, **options: Any) -> "StagedDataset":
+    def _open(
+        cls,
+        make: Callable[..., Any],
+        check: Callable[[Path], None],
+        root: str | Path | None,
+        repo_id: str,
+        *args: Any,
+        batch_encoding_size: int = 1,
+        **options: Any,
+    ) -> "StagedDataset":
         if batch_encoding_size > 1:
             logger.warning("Videos are encoded episode by episode: an episode is safe when its videos are.")
+        path = Path(root or HF_LEROBOT_HOME / repo_id).expanduser().resolve()
         with contextlib.ExitStack() as stack:
             directory = stack.enter_context(StagedDirectory(path))
-            if not is_empty(path) and (faults := inspect(path, decode=False).faults):
-                raise ValueError(
-                    f"{path} is damaged ({faults[0]}). `ufrnn repair --root={path} --dry_run=true` says what can be "
-                    "kept, and without --dry_run keeps it."
-                )
-            dataset = make(*args, root=directory.stage(), **options)
+            check(path)
+            dataset = make(repo_id, *args, root=directory.stage(), **options)
             dataset.meta.__class__ = _OneFilePerEpisode
-            dataset._directory, dataset._opened = directory, stack.pop_all()
-            dataset._saved = dataset.num_episodes
+            dataset._directory, dataset._saved = directory, dataset.num_episodes
+            dataset._opened = stack.pop_all()
         return dataset
 
     def save_episode(self, episode_data: dict | None = None, parallel_encoding: bool = True) -> None:
@@ -121,5 +122,16 @@ class StagedDataset(LeRobotDataset):
                 )
 
 
-def _resolve(repo_id: str, root: str | Path | None) -> Path:
-    return Path(root or HF_LEROBOT_HOME / repo_id).expanduser().resolve()
+def _refuse_to_overwrite(path: Path) -> None:
+    if not is_empty(path):
+        raise FileExistsError(f"{path} is not empty. Use --resume=true to record more into it, or another root.")
+
+
+def _refuse_unless_whole(path: Path) -> None:
+    if is_empty(path):
+        raise FileNotFoundError(f"{path} holds nothing to go on with. Leave out --resume, or name another root.")
+    if faults := inspect(path, decode=False).faults:
+        raise ValueError(
+            f"{path} is damaged ({faults[0]}). `ufrnn repair --root={path} --dry_run=true` says what can be kept, and "
+            "without --dry_run keeps it."
+        )

@@ -33,6 +33,10 @@ class StagedDirectory:
         self._lock = FileLock(self._work / "lock")
 
     def __enter__(self) -> "StagedDirectory":
+        if self.root.is_mount():
+            raise OSError(
+                f"{self.root} is a mount point, which cannot be replaced as a whole: choose a folder inside it"
+            )
         try:
             self._work.mkdir(parents=True, exist_ok=True)
             self._lock.acquire(timeout=0)

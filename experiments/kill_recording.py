@@ -7,7 +7,6 @@ had returned; then the next recording goes on with it until it is killed, too.
 
 import os
 import random
-import signal
 import sys
 import tempfile
 import time
@@ -16,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from multiprocessing import forkserver, get_context
 from multiprocessing.context import ForkServerContext
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
@@ -154,11 +154,10 @@ def saved_episodes(log: Path) -> int | None:
     return int(begun[-1]) if begun else None
 
 
-def record_and_kill(name: str, root: Path, first: int, seconds: float) -> tuple[int, int]:
-    """Records and kills after some time; returns how many episodes there were before, and how many were saved."""
-    log = root.parent / f"{root.name}.log"
+def begin(name: str, root: Path, first: int, log: Path, target: Callable[..., None] = work) -> tuple[BaseProcess, int]:
+    """Starts a recording; returns it and how many episodes there were before, as soon as it records."""
     log.unlink(missing_ok=True)
-    process = forking().Process(target=work, args=(name, root, first, log))
+    process = forking().Process(target=target, args=(name, root, first, log))
     process.start()
     deadline = time.monotonic() + START_SECONDS
     while (before := saved_episodes(log)) is None:
@@ -166,11 +165,17 @@ def record_and_kill(name: str, root: Path, first: int, seconds: float) -> tuple[
             process.kill()
             raise RuntimeError(f"{name} did not begin to record:\n{log.read_text()[-2000:]}")
         time.sleep(0.002)
+    return process, before
+
+
+def record_and_kill(name: str, root: Path, first: int, seconds: float) -> tuple[int, int]:
+    """Records and kills after some time; returns how many episodes there were before, and how many were saved."""
+    log = root.parent / f"{root.name}.log"
+    process, before = begin(name, root, first, log)
     time.sleep(seconds)
     if not process.is_alive():
         raise RuntimeError(f"{name} ended by itself:\n{log.read_text()[-2000:]}")
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGKILL)
+    process.kill()
     process.join()
     saved = saved_episodes(log)
     assert saved is not None

@@ -134,6 +134,13 @@ def test_unwritable_place_is_named(tmp_path):
         pass
 
 
+def test_a_mount_point_is_refused_before_anything_is_recorded(tmp_path, root, monkeypatch):
+    monkeypatch.setattr(type(root), "is_mount", lambda path: path == root)
+    with pytest.raises(OSError, match="is a mount point"), StagedDirectory(root):
+        pass
+    assert os.listdir(tmp_path) == ["root"]
+
+
 def test_exchange_of_a_missing_path_changes_nothing(tmp_path):
     (tmp_path / "a").write_text("a")
     assert not exchange(tmp_path / "a", tmp_path / "b")

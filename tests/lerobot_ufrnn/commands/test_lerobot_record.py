@@ -95,6 +95,23 @@ def test_going_on_with_nothing_is_refused(root, capsys):
     assert "nothing to go on with" in capsys.readouterr().err
 
 
+def test_repair_says_what_it_drops_and_a_dry_run_changes_nothing(root, capsys):
+    record(root, episodes=3)
+    episodes = read_whole(root)
+    assert main(["repair", f"--root={root}"]) == 0
+    assert f"{root} is whole: 3 episodes (" in capsys.readouterr().out
+    os.truncate(damaged := root / "data/chunk-000/file-001.parquet", 1000)
+    assert record(root, SESSION) == 1
+    assert f"`ufrnn repair --root={root} --dry_run=true`" in capsys.readouterr().err
+    for flags, verb in ((["--dry_run=true"], "Would keep"), ([], "Kept")):
+        assert os.path.getsize(damaged) == 1000
+        assert main(["repair", f"--root={root}", *flags]) == 0
+        text = capsys.readouterr().out
+        assert "episode 1: data/chunk-000/file-001.parquet has 0 of its" in text
+        assert f"{verb} 1 episodes ({len(episodes[0])} frames) of 3 in {root}." in text
+    assert read_whole(root) == episodes[:1]
+
+
 @pytest.mark.parametrize("number", [0, 1])
 @pytest.mark.parametrize("error", [RuntimeError("the arm was stopped"), KeyboardInterrupt()])
 def test_an_episode_that_fails_leaves_those_before_it(root, monkeypatch, number, error):
