@@ -1,7 +1,7 @@
-"""Is every saved episode kept when the computer loses power? Simulated with a file system of its own; needs Linux and root.
+"""Is every saved episode kept when the computer loses power? Simulated, on Linux as root.
 
-Recordings go to an ext4 file system in a file. At a random moment they are stopped, and the file is copied: a copy has what
-has been written to the disk and lacks what is still in memory. It is mounted and read as after a loss of power. As a
+Recordings go to an ext4 file system in a file. At a random moment they are stopped, and the file is copied: the copy
+has what was written to the disk, not what was still in memory. It is mounted and read as after a loss of power. As a
 control, some recordings do not wait for the disk. What a drive loses of its own write cache is not simulated.
 """
 
@@ -28,7 +28,7 @@ from lerobot_ufrnn.analysis.results import markdown
 class PowerLossConfig:
     """How often to try, and where the table goes."""
 
-    trials: int = 5  # with each way to record
+    trials: int = 4  # with each way to record
     controls: int = 1  # the same without waiting for the disk
     max_seconds: float = 3.0  # latest moment of the loss after the recording has begun, in s
     seed: int = 0  # of the moments
@@ -42,7 +42,7 @@ class PowerLossConfig:
 
 def work_without_waiting(name: str, root: Path, first: int, log: Path) -> None:
     """Body of a control."""
-    os.fsync = lambda descriptor: None
+    os.fsync = lambda fd: None
     work(name, root, first, log)
 
 
@@ -57,7 +57,7 @@ def mounted(image: Path, folder: Path) -> Iterator[None]:
 
 
 def lose_power(name: str, waits: bool, seconds: float, folder: Path) -> tuple[int, int | str]:
-    """Records until the power is lost; returns how many episodes were saved, and how many can be read then, or why not."""
+    """Records until the power is lost; returns how many episodes were saved, and how many are readable, or why not."""
     image, copy, place, log = (folder / part for part in ("image", "copy", "place", "log"))
     place.mkdir(exist_ok=True)
     with image.open("wb") as file:
