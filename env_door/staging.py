@@ -2,7 +2,8 @@
 
 LeRobot writes a dataset file by file and closes its parquet files last: a recording killed half-way is unreadable.
 Here every change is made to a copy beside the directory, and the finished copy takes the directory's place in a
-single rename. Large files are hard-linked into the copy, so that a change costs what it adds.
+single rename, after everything in it has reached the disk. Large files are hard-linked into the copy, so that a change
+costs what it adds.
 """
 
 import contextlib
@@ -32,6 +33,10 @@ class StagedDirectory:
         self._lock = FileLock(self._work / "lock")
 
     def __enter__(self) -> "StagedDirectory":
+        if self.root.is_mount():
+            raise OSError(
+                f"{self.root} is a mount point, which cannot be replaced as a whole: choose a folder inside it"
+            )
         try:
             self._work.mkdir(parents=True, exist_ok=True)
             self._lock.acquire(timeout=0)
@@ -57,25 +62,44 @@ class StagedDirectory:
     def change(self) -> Iterator[Path]:
         """Give a copy of the directory to change, and put it in the directory's place when the block succeeds.
 
-        Files under `meta/` are copied; all others are hard-linked and must not be changed in place, only added to
-        or replaced. Temporary files made inside the block (by `tempfile`) go to the working folder too. The copy does
-        not exist when the directory does not exist yet or is empty.
+        What holds of the copy of `stage` holds of this one. Temporary files made inside the block (by `tempfile`) go to
+        the working folder too.
         """
         outside = tempfile.tempdir
         self._scratch.mkdir()
         try:
             tempfile.tempdir = str(self._scratch)
-            if not is_empty(self.root):
-                shutil.copytree(self.root, self._staged, copy_function=_link_or_copy)
-            yield self._staged
-            if is_empty(self.root):
-                os.replace(self._staged, self.root)
-            elif not exchange(self._staged, self.root):
-                os.rename(self.root, self._previous)
-                os.rename(self._staged, self.root)
+            yield self.stage()
+            self.commit()
         finally:
             tempfile.tempdir = outside
             self._clear()
+
+    def stage(self) -> Path:
+        """Make the copy to change. It does not exist when the directory does not exist yet or is empty.
+
+        Files under `meta/` are copied; all others are hard-linked and must not be changed in place, only added to
+        or replaced.
+        """
+        if not is_empty(self.root):
+            shutil.copytree(self.root, self._staged, copy_function=_link_or_copy)
+        return self._staged
+
+    def commit(self) -> None:
+        """Put the changed copy in the directory's place; an error leaves the directory as it was."""
+        _synchronize(self._staged)
+        if is_empty(self.root):
+            os.replace(self._staged, self.root)
+        elif not exchange(self._staged, self.root):
+            os.rename(self.root, self._previous)
+            try:
+                os.rename(self._staged, self.root)
+            except OSError:
+                os.rename(self._previous, self.root)
+                raise
+        _synchronize_entry(self.root.parent)
+        _synchronize_entry(self._work)
+        self._clear()
 
     def _clear(self) -> None:
         for leftover in (self._staged, self._previous, self._scratch):
@@ -106,3 +130,21 @@ def _link_or_copy(source: str, target: str) -> None:
             os.link(source, target)
             return
     shutil.copy2(source, target)
+
+
+def _synchronize(folder: Path) -> None:
+    """Let a copy reach the disk, so that a loss of power after the rename finds whole files in it."""
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            path = Path(parent, name)
+            if path.stat().st_nlink == 1:  # what is linked from the directory was synchronized when it was new
+                _synchronize_entry(path)
+        _synchronize_entry(Path(parent))
+
+
+def _synchronize_entry(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

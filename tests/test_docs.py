@@ -12,6 +12,7 @@ from typing import Any, get_type_hints
 import draccus
 import pytest
 import yaml
+from lerobot.scripts.lerobot_record import RecordConfig
 
 from env_door.configuration_door import DoorEnvConfig
 from env_forks.configuration_forks import ForksEnvConfig
@@ -75,7 +76,7 @@ def code(path: Path) -> list[str]:
 def commands(path: Path) -> Iterator[tuple[str, set[str]]]:
     """Each `ufrnn COMMAND` and `python experiments/SCRIPT` with the names of its flags."""
     for line in code(path):
-        for found in re.finditer(r"\b(ufrnn [a-z]\w*|python experiments/\w+\.py)\b(.*)", line):
+        for found in re.finditer(r"\b(ufrnn [a-z][\w-]*|python experiments/\w+\.py)\b(.*)", line):
             words = shlex.split(re.sub(r"[<>]", "", found[2]), comments=True)
             yield found[1], {word[2:].split("=")[0] for word in words if word.startswith("--")} - {"help"}
 
@@ -137,8 +138,8 @@ def test_commands_and_their_flags_exist(path: Path):
         if command.startswith("ufrnn "):
             name = command.removeprefix("ufrnn ")
             assert name in COMMANDS
-            run = import_module(f"lerobot_ufrnn.commands.{name}").run
-            known = {field.name for field in fields(get_type_hints(run)["config"])}
+            run = import_module(f"lerobot_ufrnn.commands.{name.replace('-', '_')}").run
+            known = {field.name for field in fields(get_type_hints(run).get("config", RecordConfig))}
         else:
             known = set(re.findall(r"\w+", (ROOT / command.removeprefix("python ")).read_text()))
         assert {flag.split(".")[0] for flag in flags} <= known, command

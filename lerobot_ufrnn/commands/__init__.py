@@ -13,6 +13,8 @@ from draccus.utils import DecodingError, ParsingError
 COMMANDS = {
     "demo": "record, train, evaluate and draw: the whole path with one command",
     "record": "record demonstrations of the scripted expert into a LeRobotDataset",
+    "lerobot-record": "record with a robot: LeRobot's own command and flags, but each saved episode outlives a kill",
+    "repair": "keep the whole episodes of a damaged LeRobotDataset, and say what was dropped",
     "results": "turn the trial log of lerobot-eval into a table per door",
     "foresight": "draw what foresight imagines where the policy has to choose",
     "video": "film a door that is found out: a wrong try, back to the fork, another try",
@@ -23,7 +25,7 @@ COMMANDS = {
 
 USAGE = f"""usage: ufrnn COMMAND [--flag=value ...]
 
-{"".join(f"  {name:<10} {summary}\n" for name, summary in COMMANDS.items())}
+{"".join(f"  {name:<15} {summary}\n" for name, summary in COMMANDS.items())}
 `ufrnn COMMAND --help` explains the flags of a command. Training and evaluation are LeRobot's own commands:
   lerobot-train --policy.type=ufrnn --dataset.repo_id=...
   lerobot-eval --policy.path=... --env.type=door --env.task=all
@@ -51,7 +53,7 @@ def parse_flags[Config](config_class: type[Config], arguments: list[str], prog: 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one subcommand: the function `run` of its module, with the configuration that `run` takes.
+    """Runs one subcommand: the function `run` of its module, with the configuration or the words that `run` takes.
 
     Without `arguments` those of the command line. Exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted.
     """
@@ -63,8 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"ufrnn: unknown command '{name}'\n\n{USAGE}", end="", file=sys.stderr)
         return 2
     try:
-        run = import_module(f"{__name__}.{name}").run
-        run(parse_flags(get_type_hints(run)["config"], rest, f"ufrnn {name}"))
+        run = import_module(f"{__name__}.{name.replace('-', '_')}").run
+        config_class = get_type_hints(run).get("config")
+        run(parse_flags(config_class, rest, f"ufrnn {name}") if config_class else rest)
     except KeyboardInterrupt:
         print(f"\nufrnn {name}: interrupted", file=sys.stderr)
         return 130

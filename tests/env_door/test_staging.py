@@ -43,6 +43,44 @@ def test_change_replaces_the_directory(tmp_path, root, monkeypatch, can_exchange
     assert contents(tmp_path) == {"root/meta/info": "new", "root/data": "kept", "root/more": "added"}
 
 
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_all_that_is_new_is_on_the_disk_before_it_takes_the_place(tmp_path, root, monkeypatch, can_exchange):
+    """So that a loss of power leaves the old directory or the new one."""
+    synchronized, at_exchange, fsync = set(), [], os.fsync
+
+    def remember(descriptor):
+        fsync(descriptor)
+        synchronized.add(os.fstat(descriptor).st_ino)
+
+    def look(first, second):
+        new = [first, *first.rglob("*")]
+        at_exchange.append({path.name for path in new if path.stat().st_ino not in synchronized})
+        return can_exchange and exchange(first, second)
+
+    monkeypatch.setattr(os, "fsync", remember)
+    monkeypatch.setattr("env_door.staging.exchange", look)
+    with StagedDirectory(root) as directory, directory.change() as staged:
+        (staged / "deep").mkdir()
+        (staged / "deep" / "more").write_text("added")
+    assert at_exchange == [{"data"}]  # the one that was linked, not written
+    assert tmp_path.stat().st_ino in synchronized
+
+
+def test_a_directory_that_cannot_be_replaced_stays(tmp_path, root, monkeypatch):
+    rename = os.rename
+
+    def fail(source, target):
+        if source.name == "staged":
+            raise OSError("busy")
+        rename(source, target)
+
+    monkeypatch.setattr("env_door.staging.exchange", lambda first, second: False)
+    monkeypatch.setattr(os, "rename", fail)
+    with pytest.raises(OSError, match="busy"), StagedDirectory(root) as directory, directory.change() as staged:
+        (staged / "more").write_text("added")
+    assert contents(tmp_path) == {"root/meta/info": "old", "root/data": "kept"}
+
+
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
 def test_failed_change_leaves_everything_as_it_was(tmp_path, root, error):
     def change_half():
@@ -94,6 +132,13 @@ def test_unwritable_place_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="choose a writable root"), StagedDirectory(tmp_path / "file" / "root"):
         pass
+
+
+def test_a_mount_point_is_refused_before_anything_is_recorded(tmp_path, root, monkeypatch):
+    monkeypatch.setattr(type(root), "is_mount", lambda path: path == root)
+    with pytest.raises(OSError, match="is a mount point"), StagedDirectory(root):
+        pass
+    assert os.listdir(tmp_path) == ["root"]
 
 
 def test_exchange_of_a_missing_path_changes_nothing(tmp_path):

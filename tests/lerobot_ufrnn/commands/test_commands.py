@@ -27,7 +27,7 @@ def test_help_names_every_command_and_like_the_demo_while_its_stages_run_holds_n
     assert not heavy & set(modules[1].split())
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "lerobot-record"])  # LeRobot's own help
 def test_help_of_a_command_names_it_and_explains_every_flag(command, capsys):
     with pytest.raises(SystemExit) as ended:
         main([command, "--help"])
@@ -63,6 +63,7 @@ def test_an_unknown_command_is_refused(capsys):
         (["lyapunov", "--policy_paths=[]", "--dataset_dir=/nowhere"], "--policy_paths must name one or more"),
         (["lyapunov", "--policy_paths=[a]", "--dataset_dir=/nowhere", "--horizon=0"], "`horizon` must be at least 1"),
         (["video", "--policy_path=/nowhere"], "/nowhere"),
+        (["repair", "--root=/nowhere"], "/nowhere is no LeRobotDataset: meta/info.json is missing"),
         (["video", "--policy_path=a", "--size=1000"], "`size` must be at least 16 and at most 768, got 1000"),
         (["video", "--policy_path=a", "--num_steps=0"], "`num_steps` must be at least 1"),
     ],
