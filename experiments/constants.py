@@ -54,13 +54,13 @@ COUNTS = ["trials", "opened", "wrong_first", "recovered"]
 
 @dataclass
 class ConstantsConfig:
-    """Which networks to try; on one core an hour for all tasks."""
+    """Which networks to try; on one core half an hour for all tasks."""
 
     tasks: list[str] = field(default_factory=lambda: list(TASKS))  # names of tasks
     set: int = 0  # of demonstrations
     train_seed: int = 0
     updates: int = 1500
-    trials_per_way: int = 4
+    trials_per_way: int = 2
     output_dir: Path = SuiteConfig.output_dir  # where suite.py keeps its networks
     results: Path = RESULTS / "constants"  # folder of counts.csv and table.md
 
