@@ -29,7 +29,7 @@ def write(path, *events):
 class World:
     """The arm, and in place of the robot's servo what brings it at once where it is sent; a period passes with each."""
 
-    fault = None
+    fault, speed_scaling = None, 1.0
 
     def __init__(self):
         self.arm, self.clock, self.sent, self.leads, self.order = fakes.FakeArmState(), fakes.Clock(), [], [], []
@@ -64,7 +64,7 @@ def world(monkeypatch):
     monkeypatch.setattr(twist_teleoperator, "monotonic", world.clock)
     monkeypatch.setattr(lerobot_record, "init_keyboard_listener", lambda: (None, world.controls))
     monkeypatch.setattr(robot, "Servo", lambda _: world)
-    monkeypatch.setattr(robot.UR5eRobotiq, "_check_ready", lambda _: None)
+    monkeypatch.setattr(robot, "check_ready", lambda _: None)
     return world
 
 
