@@ -120,7 +120,7 @@ def test_a_jump_is_limited_and_what_was_sent_is_told_and_what_is_no_action_is_re
     assert np.abs(measured(connected) - start).max() <= connected.config.command_limit + 5e-3
 
 
-@pytest.mark.parametrize("rate", [10, 60, 125])
+@pytest.mark.parametrize("rate", [*(pytest.param(rate, marks=pytest.mark.slow) for rate in (10, 60)), 125])
 def test_no_motion_is_lost_whatever_the_rate_of_actions(twin, connected, rate):
     speed, way = 0.4, 0.6  # rad/s and rad of the last joint
     start = measured(connected)
@@ -134,6 +134,7 @@ def test_no_motion_is_lost_whatever_the_rate_of_actions(twin, connected, rate):
     assert measured(connected)[-1] - start[-1] == pytest.approx(way, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_a_speed_slider_that_is_not_at_its_end_is_told_at_connect_and_on_change(twin, robot, caplog):
     def told():
         return [record.getMessage() for record in caplog.records if "speed" in record.getMessage()]
@@ -273,7 +274,7 @@ def test_a_servo_process_that_somebody_else_ends_is_told_and_nothing_goes_on(twi
     wait_until(lambda: twin.state()["program"] == "STOPPED", 2.0)
 
 
-@pytest.mark.parametrize("name", ["close_link", "close_control"])
+@pytest.mark.parametrize("name", ["close_link", pytest.param("close_control", marks=pytest.mark.slow)])
 def test_a_link_that_closes_in_order_is_lost_and_leaves_no_program_behind(twin, connected, name):
     move(connected, TURN, 2)
     twin.inject(name)
@@ -324,6 +325,7 @@ def test_who_comes_second_does_not_disturb_the_first(twin, connected):
     move(connected, TURN, 1)
 
 
+@pytest.mark.slow
 def test_registers_that_somebody_else_writes_are_told_with_what_to_do(twin, robot):
     with socket.create_connection((twin.address, ports.RTDE)) as fieldbus:
         names = b"input_int_register_0"
