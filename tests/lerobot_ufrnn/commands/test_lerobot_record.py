@@ -69,7 +69,7 @@ def test_nothing_is_lost_through_many_kills(name, tmp_path):
     assert row["episodes saved"] > 0
 
 
-@pytest.mark.parametrize("flags", [(), STREAMED, IMAGES])
+@pytest.mark.parametrize("flags", [(), *(pytest.param(flags, marks=pytest.mark.slow) for flags in (STREAMED, IMAGES))])
 def test_recordings_go_on_with_and_without_ours(root, flags, monkeypatch):
     assert record(root, flags=flags) == 0
     assert len(read_whole(root)) == 2

@@ -318,6 +318,7 @@ def test_a_program_that_runs_already_is_stopped_only_if_that_is_asked_for(twin, 
     assert twin.state()["program"] == "STOPPED"
 
 
+@pytest.mark.slow
 def test_who_comes_second_does_not_disturb_the_first(twin, connected):
     with pytest.raises(RobotFaultError) as told:
         make_robot(twin.address).connect()
