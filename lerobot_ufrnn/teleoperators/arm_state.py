@@ -36,7 +36,7 @@ class ArmState:
     def open(self) -> None:
         """Connects to the controller; an `ImportError` or an `ArmStateError` says what that lacks."""
         ip = self._config.robot_ip
-        _, rtde_receive, _ = import_client("Teleoperating the arm")
+        _, rtde_receive = import_client("Teleoperating the arm")
         try:
             # The client's constructor cannot be interrupted; find out in a way that can whether anybody is there.
             socket.create_connection((ip, RTDE_PORT), TIMEOUT_SECONDS).close()

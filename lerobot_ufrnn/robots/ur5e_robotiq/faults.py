@@ -45,8 +45,15 @@ class Fault(IntEnum):
 
 # The controller's safety modes, as RTDE numbers them and as the dashboard names them.
 SAFETY_MODES = {
-    **{1: "NORMAL", 2: "REDUCED", 3: "PROTECTIVE_STOP", 4: "RECOVERY", 5: "SAFEGUARD_STOP"},
-    **{6: "SYSTEM_EMERGENCY_STOP", 7: "ROBOT_EMERGENCY_STOP", 8: "VIOLATION", 9: "FAULT"},
+    1: "NORMAL",
+    2: "REDUCED",
+    3: "PROTECTIVE_STOP",
+    4: "RECOVERY",
+    5: "SAFEGUARD_STOP",
+    6: "SYSTEM_EMERGENCY_STOP",
+    7: "ROBOT_EMERGENCY_STOP",
+    8: "VIOLATION",
+    9: "FAULT",
 }
 MAY_MOVE = ("NORMAL", "REDUCED")
 _STOPS = {

@@ -37,10 +37,9 @@ STATE_SIZE = 15
 TEXT_SIZE = 400
 
 
-def import_client(what: str = "--robot.type=ur5e_robotiq") -> tuple[Any, Any, Any]:
-    """The controller's client library, needed by `what`: `rtde_control`, `rtde_receive` and `dashboard_client`."""
+def import_client(what: str = "--robot.type=ur5e_robotiq") -> tuple[Any, Any]:
+    """The controller's client library, needed by `what`: `rtde_control` and `rtde_receive`."""
     try:
-        import dashboard_client
         import rtde_control
         import rtde_receive
     except ImportError as error:
@@ -48,7 +47,7 @@ def import_client(what: str = "--robot.type=ur5e_robotiq") -> tuple[Any, Any, An
             f"{what} needs ur_rtde, which cannot be imported ({error}): `pip install 'lerobot_policy_ufrnn[ur5e]'`. "
             "Everything else works without it."
         ) from error
-    return rtde_control, rtde_receive, dashboard_client
+    return rtde_control, rtde_receive
 
 
 class Mailbox:
@@ -205,7 +204,7 @@ class _Driver:
     def connect(self) -> None:
         """Connects to the controller and arms its watchdog."""
         config = self._config
-        rtde_control, rtde_receive, _ = import_client()
+        rtde_control, rtde_receive = import_client()
         try:
             self._receive = rtde_receive.RTDEReceiveInterface(config.ip, config.servo_frequency)
             self._control = rtde_control.RTDEControlInterface(config.ip, config.servo_frequency)

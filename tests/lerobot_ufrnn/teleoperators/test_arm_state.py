@@ -52,7 +52,7 @@ def test_silence_before_the_first_look_and_nonsense_are_told_too(monkeypatch, jo
         getTimestamp=lambda: 1.0, getActualQ=lambda: joints, isConnected=lambda: True, disconnect=lambda: None
     )
     library = SimpleNamespace(RTDEReceiveInterface=lambda *_: client)
-    monkeypatch.setattr(arm_state, "import_client", lambda _: (None, library, None))
+    monkeypatch.setattr(arm_state, "import_client", lambda _: (None, library))
     clock = fakes.Clock()
     with socket.create_server(("127.0.0.9", RTDE_PORT)):
         arm = make_arm("127.0.0.9", clock)
