@@ -11,7 +11,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from env_door.checks import check_range
-from env_door.latch import EIGHT_KINDS, KINDS
+from env_door.latch import EIGHT_KINDS, KINDS, beyond_three
 from env_door.limits import EPISODE_STEPS, FPS, IMAGE_SIZE, check_door
 from env_door.scene import ARMS
 from env_door.suites import WithoutRolloutOption, make_suites
@@ -87,8 +87,7 @@ class DoorEnvConfig(EnvConfig):
         """Keywords of `gym.make`, but for the kind of the door."""
         names = ("arm", "door_offset", "start_variation", "command_limit", "hold_seconds", "disable_env_checker")
         settings = {name: getattr(self, name) for name in names}
-        eight = not {*self.kinds} <= {*KINDS, "random"}
-        return settings | {"max_episode_steps": self.episode_length, "eight": eight}
+        return settings | {"max_episode_steps": self.episode_length, "eight": beyond_three(self.kinds)}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """Make the vector environments, one suite for each kind of door: `door_push`, `door_pull` and so on."""

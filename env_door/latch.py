@@ -65,6 +65,11 @@ EIGHT_KINDS = tuple(OPENINGS)
 """All kinds: four directions, each with the knob turned clockwise or counter-clockwise (`_ccw`) first."""
 
 
+def beyond_three(kinds: Sequence[str]) -> bool:
+    """Whether doors of these kinds, which may be `random`, must be told from all eight instead of from three."""
+    return not {*kinds} <= {*KINDS, "random"}
+
+
 def check_kinds(kinds: Sequence[str], option: str) -> None:
     """Raises ParsingError unless the names are those of kinds of door, each once; `option` is what the user set."""
     if not kinds or sorted(kinds) != sorted(set(kinds) & set(EIGHT_KINDS)):

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from env_door.demonstration import Demonstration, demonstrate, spread
 from env_door.env import DoorEnv
-from env_door.latch import KINDS
+from env_door.latch import beyond_three
 from env_door.limits import FPS
 from env_door.provenance import Provenance
 from env_door.recording_config import DatasetConfig, RecordConfig
@@ -57,7 +57,7 @@ class RecordReport:
 
 def record(config: RecordConfig) -> RecordReport:
     """Record demonstrations of the door's expert; see [`record_demonstrations`]."""
-    eight = not set(config.kinds) <= set(KINDS)
+    eight = beyond_three(config.kinds)
     with contextlib.closing(DoorEnv(config.kinds[0], config.arm, config.door_offset, eight=eight)) as env:
 
         def demonstrate_kind(kind: str, seed: int) -> Demonstration | None:
