@@ -15,7 +15,8 @@ from .checkpoint import find_weights, read_weights
 from .configuration_ufrnn import UFRNNConfig
 from .demonstrations import Demonstrations, Moments
 from .episodes import Episode, EpisodeStore
-from .foresight import UFRNN, ForesightTrace, Memory
+from .foresight import ForesightTrace, Memory
+from .kernels import make_model
 from .networks import ImageEncoder, Prediction, RangeScaler, gaussian_nll
 from .recall import Recall
 
@@ -75,7 +76,7 @@ class UFRNNPolicy(PreTrainedPolicy):
         config.validate_features()
         self.image_encoder = ImageEncoder(config.cameras, config.autoencoder)
         self.joint_scaler = RangeScaler(config.joint_dim)
-        self.model = _make_model(config)
+        self.model = make_model(config)
         fps = FPS if dataset_meta is None else dataset_meta.fps
         self.demonstrations = Demonstrations(config.joint_dim, config.image_dim, fps)
         self.recall = Recall(self.model, config, self.demonstrations) if config.recall.enabled else None
@@ -387,26 +388,3 @@ def _horizon_loss(prediction: Prediction, trace: ForesightTrace, horizon: int, m
         prediction.step, target[..., None].expand_as(prediction.step), reduction="none"
     )
     return loss.mean(-1)[mask].mean()
-
-
-def _make_model(config: UFRNNConfig) -> UFRNN:
-    """The recurrent model, compiled where that is asked for and can be had."""
-    if config.kernel == "reference":
-        return UFRNN(config)
-    try:
-        from .kernels.unroll import FastUFRNN, unsupported
-    except ImportError as error:
-        if config.kernel == "fast":
-            raise ImportError(
-                f"`kernel=fast` needs Numba, which cannot be imported here ({error}). Install it (`pip install numba`) "
-                "or take --policy.kernel=reference."
-            ) from error
-        logger.warning("Numba cannot be imported (%s): taking the reference kernel, about ten times slower.", error)
-        return UFRNN(config)
-    reason = unsupported(config)
-    if reason is None:
-        return FastUFRNN(config)
-    if config.kernel == "fast":
-        raise ValueError(f"`kernel=fast` does not compile {reason}; take --policy.kernel=auto or reference.")
-    logger.info("The compiled kernel does not have %s: taking the reference kernel, about ten times slower.", reason)
-    return UFRNN(config)

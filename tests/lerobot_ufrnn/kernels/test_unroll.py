@@ -270,9 +270,9 @@ def test_without_numba_the_reference_steps_in_and_fast_says_what_is_missing():
     code = (
         "import sys; sys.modules['numba'] = None\n"
         "from small_network import network_config\n"
-        "from lerobot_ufrnn.modeling_ufrnn import _make_model\n"
-        "print(type(_make_model(network_config(kernel='auto'))).__name__)\n"
-        "try: _make_model(network_config(kernel='fast'))\n"
+        "from lerobot_ufrnn.kernels import make_model\n"
+        "print(type(make_model(network_config(kernel='auto'))).__name__)\n"
+        "try: make_model(network_config(kernel='fast'))\n"
         "except ImportError as error: print(error)\n"
     )
     env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
