@@ -81,6 +81,11 @@ class Task:
         return range(len(self.tree.ends))
 
     @property
+    def is_ambiguous(self) -> bool:
+        """Whether only trying tells the way: there are several, and no colour tells which."""
+        return len(self.ways) > 1 and not self.cue
+
+    @property
     def suites(self) -> list[str]:
         """Names of the task with each way as the one that goes on, such as `three_ways_0`."""
         return [f"{self.name}_{way}" for way in self.ways]

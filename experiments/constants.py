@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from epochs import read_model
 from jobs import replace_text
 from lerobot.envs.factory import make_env_pre_post_processors
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
 from networks import add_to_table
 from script import run
-from suite import SuiteConfig
+from suite import MODEL, SuiteConfig, make_network
 from tables import RESULTS
 
 from env_door.checks import check_range
@@ -44,8 +45,12 @@ CONSTANTS: dict[Any, tuple[str, ...]] = {
     demonstrations: ("NEIGHBOURS", "FARTHEST_NEAR"),
 }
 BOUNDED = {
-    **{"SAME_DIRECTION": (0.6, 0.9), "FADING": (0.8, 0.95), "REFUTED": (0.25, 0.75), "NEVER_ENTERED": (0.375, 0.9)},
-    **{"NEIGHBOURS": (1, 6), "LONGEST_LEAD": (2, 8)},
+    "SAME_DIRECTION": (0.6, 0.9),
+    "FADING": (0.8, 0.95),
+    "REFUTED": (0.25, 0.75),
+    "NEVER_ENTERED": (0.375, 0.9),
+    "NEIGHBOURS": (1, 6),
+    "LONGEST_LEAD": (2, 8),
 }
 """What must be below 1, half-way to it or twice as far; weights are halved, too. Others are whole numbers."""
 KEY = ["constant", "value", "task"]
@@ -67,11 +72,6 @@ class ConstantsConfig:
     def __post_init__(self) -> None:
         check_range(self, "set", "train_seed", low=0)
         check_range(self, "updates", "trials_per_way", low=1)
-
-    def checkpoint(self, task: str) -> Path:
-        """Folder of a network."""
-        network = self.output_dir / task / f"set{self.set}" / "ufrnn" / f"seed{self.train_seed}"
-        return network / "train" / "checkpoints" / f"{self.updates:06d}" / "pretrained_model"
 
 
 def usual_values() -> dict[str, float]:
@@ -102,23 +102,22 @@ def change(policy: UFRNNPolicy, name: str, value: float) -> Iterator[None]:
             setattr(owner, name, before)
 
 
-def try_ways(policy: UFRNNPolicy, checkpoint: Path, task: str, trials_per_way: int) -> list[Trial]:
-    """Trials of a task, with each way as the one that goes on."""
+def try_ways(policy: UFRNNPolicy, processors: tuple, task: str, trials_per_way: int) -> list[Trial]:
+    """Trials of a task, with each way as the one that goes on; the processors are those of policy and actions."""
     seeds = list(range(FIRST_TRIAL, FIRST_TRIAL + trials_per_way))
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "trials.jsonl"
         environment = ForksEnvConfig(task=task, trial_log=str(log))
         around = make_env_pre_post_processors(env_cfg=environment, policy_cfg=policy.config)
-        beside = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
         for suite in environment.create_envs(trials_per_way).values():
             with contextlib.closing(suite[0]) as envs:
-                rollout(envs, policy, *around, *beside, seeds=seeds)
+                rollout(envs, policy, *around, *processors, seeds=seeds)
         return read_trials(log)
 
 
 def describe(table: pd.DataFrame) -> str:
     """A row for each constant: opened trials of all tasks, and the task that lost most, smaller and larger."""
-    ambiguous = [name for name in TASKS if len(TASKS[name].ways) > 1 and not TASKS[name].cue]
+    ambiguous = [name for name, task in TASKS.items() if task.is_ambiguous]
     rates = (100 * table.opened / table.trials).groupby([table.constant, table.value, table.task]).first()
     usual = rates["none"][0.0]
     rows = []
@@ -145,17 +144,23 @@ def describe(table: pd.DataFrame) -> str:
 def main(config: ConstantsConfig) -> None:
     """Tries what is not in the table yet."""
     counts = config.results / "counts.csv"
-    done = pd.read_csv(counts)[KEY].itertuples(index=False, name=None) if counts.exists() else ()
-    missing = {(name, value, task) for name, value in changes() for task in config.tasks} - set(done)
+    done = set(pd.read_csv(counts)[KEY].itertuples(index=False, name=None)) if counts.exists() else set()
+    suite, model = SuiteConfig(output_dir=config.output_dir), read_model(MODEL)
     for task in config.tasks:
-        if not config.checkpoint(task).exists():
-            raise FileNotFoundError(f"{config.checkpoint(task)} is missing: train it with suite.py first.")
-        policy = UFRNNPolicy.from_pretrained(config.checkpoint(task))
-        for name, value in changes():
-            if (name, value, task) not in missing:
-                continue
+        missing = [(name, value) for name, value in changes() if (name, value, task) not in done]
+        if not missing:
+            continue
+        network = make_network(suite, task, config.set, model, config.train_seed)
+        if config.updates not in network.checkpoints:
+            raise FileNotFoundError(
+                f"{network.folder} has no checkpoint of update {config.updates}: run suite.py first."
+            )
+        checkpoint = network.checkpoints[config.updates] / "pretrained_model"
+        policy = UFRNNPolicy.from_pretrained(checkpoint)
+        processors = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
+        for name, value in missing:
             with change(policy, name, value):
-                trials = try_ways(policy, config.checkpoint(task), task, config.trials_per_way)
+                trials = try_ways(policy, processors, task, config.trials_per_way)
             wrong = [trial.success for trial in trials if trial.first_try_wrong]
             row = [name, value, task, len(trials), sum(trial.success for trial in trials), len(wrong), sum(wrong)]
             add_to_table(counts, pd.DataFrame([row], columns=[*KEY, *COUNTS]), KEY, pd.read_csv)

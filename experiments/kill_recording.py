@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from counting_robot import CAMERA, JOINT, picture
+from jobs import replace_text
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_record
 from script import run
@@ -124,14 +125,14 @@ def ours(root: Path, first: int, num_episodes: int) -> None:
 
 STREAMED = ("--dataset.streaming_encoding=true", "--dataset.encoder_threads=1", "--dataset.encoder_queue_maxsize=1000")
 IMAGES = ("--dataset.video=false",)
+STOCK = "`lerobot-record`"
 RECORDERS: dict[str, Recorder] = {
-    "`lerobot-record`": with_robot(stock),
+    STOCK: with_robot(stock),
     "`ufrnn lerobot-record`": with_robot(kept_record.run),
     "`ufrnn lerobot-record`, streamed": with_robot(kept_record.run, *STREAMED),
     "`ufrnn lerobot-record`, images": with_robot(kept_record.run, *IMAGES),
     "`ufrnn record`": ours,
 }
-STOCK = "`lerobot-record`"
 
 
 # ── Killing ───────────────────────────────────────────────────────────
@@ -281,8 +282,7 @@ def main(config: KillConfig) -> None:
     table = markdown(pd.DataFrame(rows))
     print(table)
     if config.output:
-        config.output.parent.mkdir(parents=True, exist_ok=True)
-        config.output.write_text(table)
+        replace_text(config.output, table)
     if any(
         row["episodes lost"] or row["unreadable"] or row["with leftovers"] for row in rows if row["command"] != STOCK
     ):

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
+from jobs import replace_text
 from kill_recording import RECORDERS, STOCK, begin, readable_episodes, saved_episodes, work
 from script import run
 
@@ -101,8 +102,7 @@ def main(config: PowerLossConfig) -> None:
     table = markdown(pd.DataFrame(rows))
     print(table)
     if config.output:
-        config.output.parent.mkdir(parents=True, exist_ok=True)
-        config.output.write_text(table)
+        replace_text(config.output, table)
     if any(row["episodes lost"] for row in rows if row["waits for the disk"] == "yes"):
         raise RuntimeError("episodes were lost whose saving had returned")
 

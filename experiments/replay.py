@@ -15,20 +15,17 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 from draccus.utils import ParsingError
-from networks import PROVENANCE_PATH, record_missing
+from networks import PROVENANCE_PATH
 from script import run
-from suite import FIRST_TRIAL, KEY, SEEDS_OF_A_SET, add_row
-from tables import RESULTS
+from suite import FIRST_TRIAL, KEY, SEEDS_OF_A_SET, SuiteConfig, add_row, demonstrations
 
 from env_door.checks import check_range
 from env_door.configuration_door import make_door
-from env_door.latch import KINDS
 from env_door.trials import Trial, read_trials
 from env_forks.configuration_forks import make_task
 from env_forks.tasks import EPISODE_STEPS, FPS, TASKS
@@ -48,8 +45,8 @@ class ReplayConfig:
     orders: list[str] = field(default_factory=lambda: list(ORDERS))
     trials_per_way: int = 10
     episodes_per_way: int = 5
-    output_dir: Path = Path("outputs/suite")  # demonstrations are here, or are recorded
-    results: Path = RESULTS / "suite"  # folder of counts.csv; the door is only printed
+    output_dir: Path = SuiteConfig.output_dir  # demonstrations are here, or are recorded
+    results: Path = SuiteConfig.results  # folder of counts.csv; the door is only printed
 
     def __post_init__(self) -> None:
         for name, allowed in (("tasks", ("door", *TASKS)), ("orders", ORDERS)):
@@ -121,15 +118,15 @@ def make_env(task: str, kind: str, log: Path) -> gym.Env:
     return make_task(task=task, way=way, trial_log=str(log), max_episode_steps=EPISODE_STEPS)
 
 
-def try_all(config: ReplayConfig, task: str, number: int, order: str) -> list[Trial]:
+def try_all(root: Path, task: str, number: int, order: str, trials_per_kind: int) -> list[Trial]:
     """Trials of all kinds or ways with a set of demonstrations."""
-    demonstrations, kinds = read_demonstrations(config.output_dir / task / f"set{number}" / "dataset")
+    recorded, kinds = read_demonstrations(root)
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "trials.jsonl"
         for kind in sorted(set(kinds)):
             with contextlib.closing(make_env(task, kind, log)) as env:
-                for seed in range(FIRST_TRIAL, FIRST_TRIAL + config.trials_per_way):
-                    replay = Replay(demonstrations, endless(order, kinds, kind, (number, seed)))
+                for seed in range(FIRST_TRIAL, FIRST_TRIAL + trials_per_kind):
+                    replay = Replay(recorded, endless(order, kinds, kind, (number, seed)))
                     observation, _ = env.reset(seed=seed)
                     ended = False
                     while not ended:
@@ -142,12 +139,9 @@ def try_all(config: ReplayConfig, task: str, number: int, order: str) -> list[Tr
 def main(config: ReplayConfig) -> None:
     """Records what is missing, tries, and adds rows."""
     for task, number, order in itertools.product(config.tasks, config.sets, config.orders):
-        home = config.output_dir / task / f"set{number}"
-        flags: dict[str, Any] = {"env": "door"} if task == "door" else {"env": "forks", "task": task}
-        flags |= {"episodes_per_kind": config.episodes_per_way, "seed": number * SEEDS_OF_A_SET}
-        ways = len(KINDS) if task == "door" else len(TASKS[task].ways)
-        record_missing(home / "dataset", home, flags, config.episodes_per_way * ways)
-        trials = try_all(config, task, number, order)
+        root, record = demonstrations(config.output_dir, task, number, config.episodes_per_way)
+        record()
+        trials = try_all(root, task, number, order, config.trials_per_way)
         wrong = [trial for trial in trials if trial.first_try_wrong]
         print(
             f"{task}, set {number}, {order}: {sum(trial.success for trial in trials)} of {len(trials)}, recovered "

@@ -11,6 +11,7 @@ that is stopped early says something of every task. Jobs of a cluster may share 
 import contextlib
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -30,6 +31,7 @@ from script import run
 from tables import RESULTS, SAME, mean_text
 
 from env_door.checks import check_range
+from env_door.latch import KINDS
 from env_door.trials import Trial, read_trials
 from env_forks.env import ForksEnv
 from env_forks.tasks import TASKS, Task
@@ -109,7 +111,8 @@ def plan(config: SuiteConfig, models: list[Model]) -> list[Network]:
 
 def make_network(config: SuiteConfig, name: str, number: int, model: Model, seed: int) -> Network:
     """A network that learns a task from one set of demonstrations."""
-    task, home = TASKS[name], config.output_dir / name / f"set{number}"
+    task = TASKS[name]
+    root, prepare = demonstrations(config.output_dir, name, number, config.episodes_per_way)
     shared = {"type": "forks", "task": name, "render_size": 64}, task.suites, config.trials_per_way, FIRST_TRIAL
     trials = []
     for update in config.updates:
@@ -118,12 +121,16 @@ def make_network(config: SuiteConfig, name: str, number: int, model: Model, seed
             key = dict(zip(KEY, (name, number, seed, update, label), strict=True))
             kept = f"{config.trials_per_way}_trials{'_' * bool(variant)}{variant}/update{update:06d}"
             trials.append(Trials(kept, update, *shared, flags, partial(add_row, config.counts, key)))
-    folder, root = home / model.name / f"seed{seed}", home / "dataset"
-    recorded = {"env": "forks", "task": name, "episodes_per_kind": config.episodes_per_way}
-    recorded |= {"seed": number * SEEDS_OF_A_SET}
-    prepare = partial(record_missing, root, home, recorded, config.episodes_per_way * len(task.ways))
-    label = f"{name}, set {number}, {model.name}, seed {seed}"
+    folder, label = root.parent / model.name / f"seed{seed}", f"{name}, set {number}, {model.name}, seed {seed}"
     return Network(label, folder, model, seed, root, config.save_freq, trials, prepare)
+
+
+def demonstrations(output_dir: Path, name: str, number: int, episodes_per_way: int) -> tuple[Path, Callable[[], None]]:
+    """Folder of a set of demonstrations of a task, or of the door, and what records those that are missing."""
+    home = output_dir / name / f"set{number}"
+    what, ways = ({"env": "forks", "task": name}, TASKS[name].ways) if name in TASKS else ({"env": name}, KINDS)
+    flags = {**what, "episodes_per_kind": episodes_per_way, "seed": number * SEEDS_OF_A_SET}
+    return home / "dataset", partial(record_missing, home / "dataset", home, flags, episodes_per_way * len(ways))
 
 
 def add_row(counts: Path, key: dict[str, Any], trials: list[Trial]) -> None:
@@ -181,7 +188,7 @@ def read_counts(path: Path) -> pd.DataFrame:
 def describe(table: pd.DataFrame) -> str:
     """All that the table says, a section for each number of updates."""
     order = [name for name in TASKS if name in set(table.task)]
-    ambiguous = [name for name in order if len(TASKS[name].ways) > 1 and not TASKS[name].cue]
+    ambiguous = [name for name in order if TASKS[name].is_ambiguous]
     sections = []
     for updates, part in sorted(table.groupby("updates"), reverse=True):
         rows = [

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import replay
+import suite
 from replay import Replay, ReplayConfig, endless
 from suite import read_counts
 
@@ -71,7 +72,7 @@ def test_rows_are_added_to_the_table_of_the_suite(tmp_path, monkeypatch, capsys)
         noted = {"settings": {}, "episodes": [{"kind": f"two_ways_{way}"} for way in (0, 1)]}
         (root / "meta" / "door_recording.json").write_text(json.dumps(noted))
 
-    monkeypatch.setattr(replay, "record_missing", record)
+    monkeypatch.setattr(suite, "record_missing", record)
     flags = ["--tasks=[two_ways]", "--sets=[0]", "--orders=[known]", "--trials_per_way=1", "--episodes_per_way=1"]
     flags += [f"--output_dir={tmp_path}", f"--results={tmp_path}"]
     replay.main(parse_flags(ReplayConfig, flags, "replay.py"))
